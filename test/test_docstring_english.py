@@ -21,6 +21,7 @@ DONE = (
     'doctor/*.py',
     'formats/**/*.py',
     'lake/*.py',
+    'live/*.py',
     'missions/*.py',
     'node/**/*.py',
     'policies/*.py',

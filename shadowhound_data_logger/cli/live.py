@@ -107,7 +107,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
         raise BadUsage(f'the live page needs aiohttp: {error}', 'install requirements/robot.txt') from error
     folder = the_spool(spool)
     tokens = the_home() / 'live'
-    paths = make_tokens(tokens, anew=new_tokens)
+    paths = make_tokens(tokens, replace=new_tokens)
     check_urls(folder, robot_url, rtsp, tiles, alert_url)
     given = LiveSettings(
         spool=folder, robot=robot or '', tokens=tokens, bind=bind, port=port, names=names, certificate=tls or None, rtsp=rtsp,

@@ -1,8 +1,8 @@
-"""Who may see the page and who may act: tokens, sign-ins, and which requests are this page's own.
+"""Access control of the page: tokens, sign-ins, and the check that a request comes from this page.
 
-Two roles have a token each, in files of mode 0600 beside the spool. A sign-in is a cookie that the token signs (HMAC-SHA256), so
-it outlives the process, and ends when the token's file is replaced or may be read by others. A file beside the tokens says what
-was signed out. No token is ever in a URL.
+Each of the two roles has a token, in files of mode 0600 next to the spool. A sign-in is a cookie signed with the token
+(HMAC-SHA256), so it survives a restart, and ends when the token's file is replaced or becomes readable by others. Another file
+lists the sign-ins that were signed out. A token is never in a URL.
 """
 
 from __future__ import annotations
@@ -33,77 +33,78 @@ log = logging.getLogger(__name__)
 VIEWER, OPERATOR = 'viewer', 'operator'
 ROLES: Final = (OPERATOR, VIEWER)
 RTSP_FILE: Final = 'rtsp.password'
-ENDED_FILE: Final = 'ended'
+SIGN_OUTS_FILE: Final = 'ended'
 COOKIE: Final = 'shadowhound_live'
 LASTS_S: Final = 12 * 3600
-"""A sign-in."""
+"""Lifetime of a sign-in."""
 MAX_FAILURES: Final = 5
 FAILURES_S: Final = 60.0
-"""After this many wrong tokens within this time an address must wait. There is no limit for all addresses together: it would
-let any host in the network lock out the operator, and nobody guesses one of our tokens, which have 192 random bits."""
+"""After this many wrong tokens within this time an address must wait. There is no limit across all addresses: it would let any
+host in the network lock out the operator, and our tokens, with 192 random bits, cannot be guessed.
+"""
 MAX_ADDRESSES: Final = 1000
-"""Addresses whose wrong tokens are remembered; beyond it the one that failed least recently is forgotten."""
+"""Maximum number of addresses with wrong tokens; beyond it the one with the oldest failure is dropped."""
 MIN_TOKEN: Final = 16
-"""Letters of a token that somebody wrote into the file."""
-MAX_ENDED: Final = 1000
-"""Sign-ins of a role that were signed out and are remembered one by one, in 28 bytes each."""
+"""Minimum letters of a token that an operator wrote into the file."""
+MAX_SIGN_OUTS: Final = 1000
+"""Maximum sign-outs per role that are remembered one by one, in 28 bytes each."""
 MAX_BYTES: Final = 100_000
-"""Of the file with these."""
+"""Maximum size of the file with these."""
 
 
 class TokenRefused(DataLoggerError):
-    """A file with a token cannot be used."""
+    """A token file cannot be used."""
 
     DEFAULT_REMEDY = 'remove it: the next start writes a new one'
 
 
 @dataclass(frozen=True, slots=True)
 class SignIn:
-    """The role of somebody who sends requests."""
+    """The role of a client."""
 
     role: str
     nonce: str = ''
-    """Of the cookie; empty for somebody of this machine who has none."""
+    """From the cookie; empty for a client on this machine without one."""
     expires: int = 0
-    """Of the cookie, Unix seconds."""
+    """From the cookie, Unix seconds."""
     csrf: str = ''
-    """What a request that acts has to bring along in a header."""
+    """The header value that every request which acts must contain."""
 
     @property
     def may_act(self) -> bool:
         return self.role == OPERATOR
 
 
-def make_tokens(folder: Path, *, anew: bool = False) -> dict[str, Path]:
-    """The file with the token of each role, created where there is none. Raises TokenRefused."""
+def make_tokens(folder: Path, *, replace: bool = False) -> dict[str, Path]:
+    """The token file of each role, created if missing. Raises TokenRefused."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     paths = {role: folder / f'{role}.token' for role in ROLES}
-    for path in (*paths.values(), folder / RTSP_FILE) if anew else paths.values():
-        _make_token(path, anew=anew)
-    for role in ROLES if anew else ():  # no cookie of before is good any more
-        (folder / f'{role}.{ENDED_FILE}').unlink(missing_ok=True)
+    for path in (*paths.values(), folder / RTSP_FILE) if replace else paths.values():
+        _make_token(path, replace=replace)
+    for role in ROLES if replace else ():  # no earlier cookie is valid any more
+        (folder / f'{role}.{SIGN_OUTS_FILE}').unlink(missing_ok=True)
     return paths
 
 
 def rtsp_password(folder: Path) -> str:
-    """The password of RTSP, made where there is none; no token, because players may store it anywhere. Raises TokenRefused."""
+    """The password of RTSP, created if missing; not a token, because players may store it anywhere. Raises TokenRefused."""
     path = folder / RTSP_FILE
     _make_token(path)
-    return token_of(path)
+    return read_token(path)
 
 
-def _make_token(path: Path, *, anew: bool = False) -> None:
-    if anew:
+def _make_token(path: Path, *, replace: bool = False) -> None:
+    if replace:
         path.unlink(missing_ok=True)
     try:
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), 'w', encoding='ascii') as file:
             file.write(f'{secrets.token_urlsafe(24)}\n')
     except FileExistsError:
-        token_of(path)
+        read_token(path)
 
 
-def token_of(path: Path) -> str:
-    """Raises TokenRefused for a file that others may read, or that holds no token."""
+def read_token(path: Path) -> str:
+    """Raises TokenRefused for a file that others can read, or without a token."""
     try:
         with path.open(encoding='utf-8') as file:
             mode = os.fstat(file.fileno()).st_mode
@@ -111,23 +112,26 @@ def token_of(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise TokenRefused(f'{path} cannot be read: {error}') from error
     if mode & 0o077:
-        raise TokenRefused(f'{path} is not for its owner alone (mode {mode & 0o777:04o})', remedy=f'chmod 600 {path}')
+        raise TokenRefused(f'{path} is not restricted to its owner (mode {mode & 0o777:04o})', remedy=f'chmod 600 {path}')
     if len(token) < MIN_TOKEN:
-        raise TokenRefused(f'{path} holds no token of at least {MIN_TOKEN} letters')
+        raise TokenRefused(f'{path} contains no token of at least {MIN_TOKEN} letters')
     return token
 
 
-class _Ended:
-    """Sign-ins of a role that were signed out, in a file that outlives the process as their cookies do.
+class _SignOuts:
+    """Sign-outs of a role, in a file that survives restarts as the cookies do.
 
-    Its lines: the SHA-256 of the rest, a time ``until``, and for each sign-in when its cookie expires and its nonce. Whatever
-    expires no later than ``until`` counts as signed out. So an entry may leave, once it has expired or when there are too many,
-    and lets nobody in again, not even when the clock is set back.
+    Its lines: the SHA-256 of the rest, a time ``until``, and for each sign-in the expiry of its cookie and its nonce. Sign-ins
+    that
+    expire no later than ``until`` count as signed out. So an entry can be dropped, once it has expired or when there are too
+    many,
+    without becoming valid again, even if the clock is set back.
 
-    A damaged file could have named anybody: all sign-ins of before count as signed out then, the log says so, and whoever has a
-    token signs in again. A file that is missing names nobody: the first sign-out makes it.
+    A damaged file could have contained any sign-in: all earlier sign-ins then count as signed out, which is logged, and users
+    sign in
+    again. A missing file contains none: the first sign-out creates it.
 
-    ``keep`` waits for the disk and is for any thread, all else for the event loop; ``_lock`` guards changes of what is known.
+    ``keep`` waits for the disk and can be called from any thread, everything else from the event loop; ``_lock`` guards changes.
     Several pages that share the tokens share the file too.
     """
 
@@ -140,27 +144,27 @@ class _Ended:
         self._until = 0
 
     def has(self, nonce: str, expires: int) -> bool:
-        """Whether the sign-in that expires then was signed out."""
+        """Whether the sign-in with this expiry was signed out."""
         self._refresh()
-        return nonce in self._known or expires <= self._until  # in this order: an entry leaves once ``_until`` counts it
+        return nonce in self._known or expires <= self._until  # in this order: an entry is dropped once ``_until`` covers it
 
     def expiry(self) -> int:
-        """When a sign-in of now expires. Raises TokenRefused where the clock was far ahead when sign-ins were ended."""
+        """The expiry of a new sign-in. Raises TokenRefused if the clock was far ahead when sign-ins were ended."""
         self._refresh()
         now = int(self._now())
         if self._until > now + 2 * LASTS_S:
             raise TokenRefused(f'{self._path} ends all sign-ins until {time.ctime(self._until)}: the clock was ahead',
-                               remedy='set the clock, or make new tokens (--new-tokens)')  # fmt: skip
+                               remedy='set the clock, or create new tokens (--new-tokens)')  # fmt: skip
         return max(now + LASTS_S, self._until + 1)
 
     def add(self, nonce: str, expires: int) -> None:
-        """In this process at once; ``keep`` makes it last."""
+        """In this process immediately; ``keep`` makes it durable."""
         self._merge({nonce: expires})
 
     def keep(self) -> None:
-        """Write all that is known here and in the file. Raises OSError."""
+        """Write everything known here and in the file. Raises OSError."""
         with flock(self._path.with_name(f'{self._path.name}.lock')):
-            self._look()
+            self._refresh_if_changed()
             with self._lock:
                 lines = [str(self._until), *(f'{expires} {nonce}' for nonce, expires in self._known.items())]
             body = '\n'.join(lines).encode()
@@ -169,15 +173,15 @@ class _Ended:
             sync(self._path.parent)
 
     def _refresh(self) -> None:
-        """Know what the file says; put a good one in the place of a damaged one."""
-        if self._look():
+        """Read the file; replace a damaged one."""
+        if self._refresh_if_changed():
             try:
                 self.keep()
             except OSError as error:
                 log.error('%s cannot be written: %s', self._path, error)  # noqa: TRY400 - an operator's matter
 
-    def _look(self) -> bool:
-        """Take in what the file says, if it is another one than before; whether it is damaged."""
+    def _refresh_if_changed(self) -> bool:
+        """Read the file if it changed; return whether it is damaged."""
         seen: tuple[int, ...] = ()
         with suppress(OSError):
             about = self._path.stat()
@@ -187,11 +191,11 @@ class _Ended:
         known, until, is_damaged = dict[str, int](), 0, False
         try:
             with self._path.open('rb') as file:
-                until, known = _ended_in(file.read(MAX_BYTES + 1))
+                until, known = _parse_sign_outs(file.read(MAX_BYTES + 1))
         except FileNotFoundError:
             pass
         except (OSError, ValueError) as error:
-            log.warning('%s is damaged (%s): all sign-ins until now have ended, and whoever has a token signs in again',
+            log.warning('%s is damaged (%s): all sign-ins until now have ended; sign in again with the token',
                         self._path, error)  # fmt: skip
             until, is_damaged = int(self._now()) + LASTS_S, True
         self._merge(known, until)
@@ -204,27 +208,27 @@ class _Ended:
             self._known |= known
             now = self._now()
             for nonce, expires in sorted(self._known.items(), key=lambda each: each[1]):
-                if expires > now and len(self._known) <= MAX_ENDED:
+                if expires > now and len(self._known) <= MAX_SIGN_OUTS:
                     break
                 self._until = max(self._until, expires)
                 del self._known[nonce]
 
 
-def _ended_in(content: bytes) -> tuple[int, dict[str, int]]:
-    """Raises ValueError for what ``_Ended`` did not write."""
+def _parse_sign_outs(content: bytes) -> tuple[int, dict[str, int]]:
+    """Raises ValueError for a file that ``_SignOuts`` did not write."""
     check_size(len(content), MAX_BYTES)
     digest, _, body = content.partition(b'\n')
     if sha256(body).hexdigest().encode() != digest:
-        raise ValueError('its hash does not fit')
+        raise ValueError('its hash does not match')
     until, *lines = body.decode().split('\n')
     entries = [line.split(' ') for line in lines]
     return int(until), {nonce: int(expires) for expires, nonce in entries}
 
 
 class Access:
-    """Decides who may do what. Used by the event loop alone, but for ``keep``.
+    """Decides which requests are allowed. Used by the event loop only, except ``keep``.
 
-    ``is_open``: whoever reaches the page may watch, which holds for a page that listens on the loopback alone.
+    ``is_open``: every client may watch, for a page that only listens on loopback.
     """
 
     def __init__(self, tokens: dict[str, Path], *, is_open: bool, now: Callable[[], float] = time.time,
@@ -235,33 +239,34 @@ class Access:
         self._monotonic = monotonic
         self._failures: dict[str, deque[float]] = {}
         self._refused: dict[str, str] = {}
-        # One each: a viewer who signs out again and again ends no operator's sign-in.
-        self._ended = {role: _Ended(path.with_name(f'{role}.{ENDED_FILE}'), now) for role, path in tokens.items()}
+        # Separate lists: a viewer who signs out repeatedly cannot end an operator's sign-in.
+        self._sign_outs = {role: _SignOuts(path.with_name(f'{role}.{SIGN_OUTS_FILE}'), now) for role, path in tokens.items()}
 
     def sign_in(self, token: str, address: str, over: SignIn | None = None) -> tuple[SignIn, str] | None:
-        """Of whoever knows a token, with the cookie; None for a wrong one. Raises TokenRefused where nobody can sign in.
+        """Sign in with a token: returns the sign-in and its cookie; None for a wrong token. Raises TokenRefused if that is
+        impossible.
 
-        It takes the place of ``over``, whose cookie came with the token: that is signed out; ``keep`` makes it last.
+        It replaces ``over``, whose cookie came with the token and which is signed out; ``keep`` makes that durable.
         """
         given = _bytes(token)
         for role in ROLES:
             try:
                 token = self._token(role)
-            except TokenRefused:  # the other role's may be good
+            except TokenRefused:  # the other role's file may be valid
                 continue
             if hmac.compare_digest(given, token.encode()):
-                nonce, expires = secrets.token_urlsafe(12), self._ended[role].expiry()  # which may refuse
+                nonce, expires = secrets.token_urlsafe(12), self._sign_outs[role].expiry()  # which may refuse
                 if over is not None:
                     self.sign_out(over)
-                    expires = self._ended[role].expiry()  # where the list is full, it is later than what that has ended
+                    expires = self._sign_outs[role].expiry()  # if the list is full, this expires later than the dropped ones
                 text = f'{role}.{expires}.{nonce}'
                 self._failures.pop(network_of(address), None)
-                return self._of(role, nonce, expires), f'{text}.{self._sign(role, text)}'
+                return self._sign_in_of(role, nonce, expires), f'{text}.{self._sign(role, text)}'
         self._fail(address)
         return None
 
     def wait_s(self, address: str) -> float:
-        """How long this address must wait before it may try another token; 0 where it need not."""
+        """How long this address must wait before its next token; 0 if it need not."""
         known = self._failures.get(network_of(address))
         if known is None or len(known) < MAX_FAILURES:
             return 0.0
@@ -269,49 +274,49 @@ class Access:
         return max(1.0, left_s) if left_s > 0 else 0.0
 
     def who(self, cookie: str | None) -> SignIn | None:
-        """Who has this cookie; None where nobody may watch who has none."""
+        """The sign-in of a cookie; None without a valid cookie, unless the page is open."""
         parts = (cookie or '').split('.')
         if len(parts) == 4:
             role, until, nonce, signature = parts
             with suppress(TokenRefused):
-                if self._is_good(role, until, nonce, f'{role}.{until}.{nonce}', signature):
-                    return self._of(role, nonce, int(until))
+                if self._is_valid(role, until, nonce, f'{role}.{until}.{nonce}', signature):
+                    return self._sign_in_of(role, nonce, int(until))
         return SignIn(VIEWER) if self._is_open else None
 
     def sign_out(self, who: SignIn) -> None:
-        """Its cookie is invalid from now on; ``keep`` makes that last."""
+        """Its cookie is invalid from now on; ``keep`` makes that durable."""
         if who.nonce:
-            self._ended[who.role].add(who.nonce, who.expires)
+            self._sign_outs[who.role].add(who.nonce, who.expires)
 
     def keep(self, role: str) -> None:
-        """Write down who of a role was signed out; waits for the disk, in any thread. Raises OSError."""
-        self._ended[role].keep()
+        """Write the sign-outs of a role to the disk; any thread. Raises OSError."""
+        self._sign_outs[role].keep()
 
     def is_csrf(self, who: SignIn, given: str) -> bool:
         """Whether a request that acts comes from the page itself."""
         return bool(who.csrf) and hmac.compare_digest(who.csrf.encode(), _bytes(given))
 
-    def _is_good(self, role: str, until: str, nonce: str, text: str, signature: str) -> bool:
-        """Whether the token of the role signed this text, which has not expired and was not signed out. Raises TokenRefused."""
+    def _is_valid(self, role: str, until: str, nonce: str, text: str, signature: str) -> bool:
+        """Whether the token of the role signed this text, and it neither expired nor was signed out. Raises TokenRefused."""
         if role not in ROLES or not until.isdecimal() or len(until) >= 12:
             return False
         is_signed = hmac.compare_digest(_bytes(signature), self._sign(role, text).encode())
-        return is_signed and int(until) > self._now() and not self._ended[role].has(nonce, int(until))
+        return is_signed and int(until) > self._now() and not self._sign_outs[role].has(nonce, int(until))
 
-    def _of(self, role: str, nonce: str, expires: int) -> SignIn:
+    def _sign_in_of(self, role: str, nonce: str, expires: int) -> SignIn:
         return SignIn(role, nonce, expires, self._sign(role, f'csrf.{nonce}'))
 
     def _sign(self, role: str, text: str) -> str:
         return hmac.new(self._token(role).encode(), _bytes(text), sha256).hexdigest()
 
     def _token(self, role: str) -> str:
-        """Read anew each time: whoever replaces the file ends all sign-ins. Raises TokenRefused, which the log says once."""
+        """Read again each time: replacing the file ends all sign-ins. Raises TokenRefused, which is logged once."""
         try:
-            token = token_of(self._paths[role])
+            token = read_token(self._paths[role])
         except TokenRefused as error:
             if self._refused.get(role) != str(error):
                 self._refused[role] = str(error)
-                log.warning('nobody is signed in as %s any more: %s', role, error)
+                log.warning('all sign-ins as %s have ended: %s', role, error)
             raise
         self._refused.pop(role, None)
         return token
@@ -326,14 +331,14 @@ class Access:
 
 
 class OwnNames:
-    """Names under which the page may be asked for: a foreign name that leads here is an attack (DNS rebinding)."""
+    """Host names of the page: a request with another name for this address is an attack (DNS rebinding)."""
 
     def __init__(self, bind: str, more: Iterable[str] = ()) -> None:
         host = socket.gethostname().lower()
         self._names = {'localhost', host, f'{host.partition(".")[0]}.local', bind.lower(), *(name.lower() for name in more)}
 
     def has(self, host: str, own_address: str) -> bool:
-        """Whether a request with this Host header, at this address of ours, is for us."""
+        """Whether a request with this Host header, at this address of ours, is for this page."""
         name = _host(f'//{host}')
         if name in self._names:
             return True
@@ -344,12 +349,12 @@ class OwnNames:
 
 
 def is_same_origin(origin: str | None, host: str, scheme: str) -> bool:
-    """Whether a request's Origin header is the page itself."""
+    """Whether a request's Origin header names this page."""
     return origin is not None and origin.lower() == f'{scheme}://{host}'.lower()
 
 
 def _bytes(text: str) -> bytes:
-    """Of what somebody sent, which may be half a surrogate pair."""
+    """Text from a client, which may contain an unpaired surrogate."""
     return text.encode(errors='surrogatepass')
 
 
@@ -361,13 +366,13 @@ def _host(url: str) -> str:
 
 
 def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-    """Without zone, and without the form that IPv4 has on a socket of IPv6. Raises ValueError."""
+    """Without zone, and IPv4-mapped IPv6 as IPv4. Raises ValueError."""
     found = ipaddress.ip_address(text.partition('%')[0])
     return getattr(found, 'ipv4_mapped', None) or found
 
 
 def network_of(address: str) -> str:
-    """The address, or of IPv6 its /64: a host there may have any address of it."""
+    """The address, or for IPv6 its /64: a host there may use any address in it."""
     try:
         found = _address(address)
     except ValueError:
@@ -376,7 +381,7 @@ def network_of(address: str) -> str:
 
 
 def is_loopback(address: str) -> bool:
-    """Whether it can be reached from this machine alone."""
+    """Whether it is reachable only from this machine."""
     try:
         return _address(address).is_loopback
     except ValueError:

@@ -40,7 +40,7 @@ class Acts:
     def __init__(self, auth: Auth, past: PastRoutes, pool: Executor, spool: Path, robot: str, *, is_of_store: bool) -> None:
         self._auth, self._past, self._pool = auth, past, pool
         self._spool, self._robot, self._is_of_store = spool, robot, is_of_store
-        self._asking = asyncio.Lock()
+        self._node_lock = asyncio.Lock()
         self._doctor: tuple[float, dict[str, Any]] | None = None
         self._examining = asyncio.Lock()
 
@@ -66,7 +66,7 @@ class Acts:
         takes = ACTS.get(do) if isinstance(do, str) else None
         if takes is None or not all(name in takes and isinstance(value, str) for name, value in given.items()):
             return problem(400, f'"do" is one of {", ".join(ACTS)}')
-        async with self._asking:
+        async with self._node_lock:
             asked = partial(self._ask, str(do), request.remote or '', given)
             return answer(await asyncio.get_running_loop().run_in_executor(self._pool, asked))
 
@@ -91,8 +91,8 @@ class Acts:
             return problem(400, 'from and to are times in UTC, in ms')
         address = request.remote or ''
         log.info('operator at %s labels %s', address, robot)
-        said = {'label': label, 'note': note, 'by': f'operator at {address}', 'from': times[0], 'to': times[1]}
-        return await self._past.ask('label', str(robot), said)
+        query = {'label': label, 'note': note, 'by': f'operator at {address}', 'from': times[0], 'to': times[1]}
+        return await self._past.ask('label', str(robot), query)
 
     async def _pull(self, request: web.Request) -> web.StreamResponse:
         """Request a sensor's objects of a time range from a robot, or cancel such a request."""
@@ -103,15 +103,15 @@ class Acts:
         times = [given.get(name) for name in ('from', 'to')]
         if not isinstance(robot, str) or not is_name(robot):
             return problem(400, 'a request names a robot')
-        said: dict[str, Any] = {'by': f'operator_{request.remote or ""}'}
+        query: dict[str, Any] = {'by': f'operator_{request.remote or ""}'}
         if isinstance(cancel, str):
-            said['cancel'] = cancel
+            query['cancel'] = cancel
         elif isinstance(sensor, str) and all(map(is_ms, times)):
-            said |= {'sensor': sensor, 'from': times[0], 'to': times[1]}
+            query |= {'sensor': sensor, 'from': times[0], 'to': times[1]}
         else:
             return problem(400, 'a request has a robot, a sensor, from and to, which are times in UTC, in ms; or cancel, an id')
-        log.info('operator at %s %s of %s', request.remote, 'cancels a request' if 'cancel' in said else 'requests data', robot)
-        return await self._past.ask('pull', robot, said)
+        log.info('operator at %s %s of %s', request.remote, 'cancels a request' if 'cancel' in query else 'requests data', robot)
+        return await self._past.ask('pull', robot, query)
 
     async def _examine(self, _: web.Request) -> web.StreamResponse:
         async with self._examining:

@@ -1,7 +1,7 @@
 """Alerts: a message to a URL when a condition of a robot begins, and another one when it ends.
 
 The page of a store checks all robots, by the catalog and the gap journal. The page of a robot checks that robot, by its spool and
-its policies. Messages are sent as JSON, with the headers by which ntfy renders JSON (https://docs.ntfy.sh/publish, "Message
+its policies. Messages are sent as JSON, with the headers that make ntfy render JSON (https://docs.ntfy.sh/publish, "Message
 templating"; ntfy 2.10 or newer). Other webhooks ignore these headers.
 """
 

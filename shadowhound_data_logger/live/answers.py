@@ -14,7 +14,7 @@ REQUEST_S: Final = 10.0
 
 
 def answer(content: Mapping[str, Any], *, compress: bool = False) -> web.Response:
-    """JSON that nobody caches."""
+    """JSON that must not be cached."""
     response = web.json_response(content, headers={'Cache-Control': 'no-store'})
     if compress:
         response.enable_compression()

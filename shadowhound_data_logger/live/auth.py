@@ -1,4 +1,4 @@
-"""Who a request is from: the guard of every route, the sign-in and the sign-out (``access.py`` has tokens and cookies)."""
+"""Authentication of requests: the guard of every route, sign-in and sign-out (``access.py`` has tokens and cookies)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shadowhound_data_logger.live.answers import answer, body_of, problem
 log = logging.getLogger(__name__)
 
 MAX_BODY: Final = 4096
-"""Bytes of a request."""
+"""Maximum size of a request, bytes."""
 IMAGES: Final = "img-src 'self';"
 SECURITY: Final[Mapping[str, str]] = {
     'Content-Security-Policy': f"default-src 'none'; script-src 'self'; style-src 'self'; {IMAGES}"
@@ -33,14 +33,14 @@ class Auth:
 
     def __init__(self, access: Access, names: OwnNames, scheme: str, about: Callable[[], Mapping[str, Any]],
                  end: Callable[[str], None], tiles: str = '') -> None:  # fmt: skip
-        """``about`` is what a signed-in page is told besides its role; ``end`` closes the connections of a sign-in's nonce.
+        """``about`` is what a signed-in page gets besides its role; ``end`` closes the connections of a sign-in's nonce.
 
-        ``tiles``: a URL whose origin the page may load pictures from.
+        ``tiles``: a URL whose origin the page may load images from.
         """
         self.access = access
         origin = urlsplit(tiles)
-        pictures = f"img-src 'self' {origin.scheme}://{origin.netloc};" if tiles else IMAGES
-        self._security = {name: value.replace(IMAGES, pictures) for name, value in SECURITY.items()}
+        image_sources = f"img-src 'self' {origin.scheme}://{origin.netloc};" if tiles else IMAGES
+        self._security = {name: value.replace(IMAGES, image_sources) for name, value in SECURITY.items()}
         self._names, self._scheme, self._about, self._end = names, scheme, about, end
 
     def routes(self) -> list[web.RouteDef]:
@@ -67,14 +67,14 @@ class Auth:
     async def guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Check the name, the origin, the size and the sign-in of a request; add the security headers to its answer."""
         try:
-            response = self._problem_of(request) or await handler(request)
+            response = self._problem(request) or await handler(request)
         except web.HTTPException as error:
             response = problem(error.status, error.text or error.reason)
         if not response.prepared:
             response.headers.update({name: value for name, value in self._security.items() if name not in response.headers})
         return response
 
-    def _problem_of(self, request: web.Request) -> web.StreamResponse | None:
+    def _problem(self, request: web.Request) -> web.StreamResponse | None:
         own = request.transport.get_extra_info('sockname') if request.transport is not None else None
         if not self._names.has(request.host, own[0] if own else ''):
             return problem(403, f'this page is not called {request.host[:100]!r}: see --hostname')
@@ -103,7 +103,7 @@ class Auth:
         try:
             found = self.access.sign_in(token, address, before) if isinstance(token, str) else None
         except TokenRefused as error:
-            log.warning('nobody can sign in: %s', error)
+            log.warning('sign-in is impossible: %s', error)
             return problem(503, str(error))
         if found is None:
             log.warning('a wrong token from %s', address)

@@ -1,4 +1,4 @@
-"""Cameras as video, for viewers (WebRTC) and players (RTSP) of one page: both take the JPEGs that are shown."""
+"""Cameras as video, for viewers (WebRTC) and players (RTSP) of one page: both use the JPEGs that are shown."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Cameras:
     """The video of a page. Lifecycle: New; ``open_rtsp`` at most once; close once. Used by one event loop."""
 
     def __init__(self, changed: Callable[[], None], pool: Executor) -> None:
-        """``changed`` is called when other topics are taken than before."""
+        """``changed`` is called when the set of topics changes."""
         self._changed, self._pool = changed, pool
         self.video: CameraVideo | None = None
         self.rtsp: RtspServer | None = None
@@ -41,11 +41,11 @@ class Cameras:
 
     @property
     def topics(self) -> frozenset[str]:
-        """Those that a viewer or a player takes."""
+        """Topics that a viewer or a player takes."""
         return frozenset().union(*(each.topics for each in (self.video, self.rtsp) if each is not None))
 
     def serve(self, topics: Iterable[str]) -> None:
-        """Let these topics be played over RTSP."""
+        """Offer these topics over RTSP."""
         if self.rtsp is not None:
             self.rtsp.serve(topics)
 
@@ -58,7 +58,7 @@ class Cameras:
 
     async def take(self, who: object, request: Mapping[str, Any], addresses: tuple[str, str],
                    tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
-        """A viewer requests a topic as video; the arguments as of ``CameraVideo.take``."""
+        """A viewer requests a topic as video; arguments as in ``CameraVideo.take``."""
         if not self.no_video and self.video is None:
             loading = asyncio.get_running_loop().run_in_executor(self._pool, import_module, 'shadowhound_data_logger.live.webrtc')
             try:
@@ -74,7 +74,7 @@ class Cameras:
             await self.video.take(who, request, addresses, tell)
 
     def end(self, who: object) -> None:
-        """A viewer takes no video any more."""
+        """A viewer stops its video."""
         if self.video is not None:
             self.video.end(who)
 

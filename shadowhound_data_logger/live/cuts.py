@@ -1,6 +1,6 @@
-"""Pieces of bags for a browser: cut by ``shadowhound-data bag cut`` in a process of its own, and kept for a few minutes.
+"""Pieces of bags for a browser: cut by ``shadowhound-data bag cut`` in a separate process, and kept for a few minutes.
 
-The address of a piece has a random name of 128 bits, so it can be given to Foxglove or Lichtblick, which have no sign-in here.
+The URL of a piece has a random name of 128 bits, so it can be opened in Foxglove or Lichtblick, which cannot sign in here.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from shadowhound_data_logger.spool.files import Tree
 log = logging.getLogger(__name__)
 
 MAX_CUT_MS: Final = 600_000
-"""Of a piece: it is on the disk of this machine for a while."""
+"""Maximum length of a piece, which is stored on this machine's disk."""
 MAX_KEPT: Final = 4
 KEPT_S: Final = 900.0
 CUT_S: Final = 300.0
@@ -43,7 +43,7 @@ SHARED: Final = {
     'Access-Control-Expose-Headers': 'Accept-Ranges, Content-Length, Content-Range, ETag',
     'Cross-Origin-Resource-Policy': 'cross-origin', 'Cache-Control': 'no-store',
 }  # fmt: skip
-"""Of answers that the viewers of other sites may read."""
+"""Headers of answers that viewers on other sites may read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +53,15 @@ class _Piece:
 
 
 class Cuts:
-    """Makes pieces, one at a time, and serves them. Used by one event loop. Close it once."""
+    """Cuts pieces, one at a time, and serves them. Used by one event loop. Close it once."""
 
     def __init__(self, auth: Auth, folder: Path, spool: Path | None) -> None:
-        """``folder`` is where pieces are; ``spool`` that of the robot itself, which may have slices that the store lacks."""
+        """``folder`` holds the pieces; ``spool`` is the robot's own, which may have slices that the store lacks."""
         self._auth, self._parent, self._spool = auth, folder, spool
         self._folder: Path | None = None
         self._cutting = asyncio.Lock()
         self._pieces: dict[str, _Piece] = {}
-        for old in folder.glob(f'{FOLDER}*'):  # of a page that was killed
+        for old in folder.glob(f'{FOLDER}*'):  # from a page that was killed
             if time.time() - old.stat().st_mtime > 2 * KEPT_S:
                 shutil.rmtree(old, ignore_errors=True)
 
@@ -76,7 +76,7 @@ class Cuts:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     async def _cut(self, request: web.Request) -> web.StreamResponse:
-        """Make the piece of a bag; the answer has its address."""
+        """Cut a piece of a bag; the answer has its URL."""
         who = self._auth.who(request)
         if who.csrf and not self._auth.access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
             return problem(403, 'the request does not come from this page')
@@ -109,23 +109,23 @@ class Cuts:
         if self._spool is not None:
             local = Tree(self._spool).path(State.PENDING, None, BUCKET, f'{robot}/rosbags/{bag}')
             sources += [str(local)] if await asyncio.to_thread(local.is_dir) else []
-        said: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         for source in sources:
-            said = await self._run(robot, source, begin_ms, end_ms, folder / 'cut')
-            if 'error' not in said:
+            result = await self._run(robot, source, begin_ms, end_ms, folder / 'cut')
+            if 'error' not in result:
                 break
         files = await asyncio.to_thread(lambda: sorted((folder / 'cut').glob('*.mcap')))
-        if 'error' in said or len(files) != 1:
+        if 'error' in result or len(files) != 1:
             await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
-            return problem(503, said.get('error', 'nothing was cut'))
+            return problem(503, result.get('error', 'nothing was cut'))
         self._pieces[name] = _Piece(files[0], time.monotonic())
         asyncio.get_running_loop().call_later(KEPT_S + 1, self._forget)
-        seconds = (said['t_end_ns'] - said['t_start_ns']) / SECOND
-        return answer({'path': f'/cut/{name}.mcap', 'bytes': said['bytes'], 'messages': said['messages'], 'seconds': seconds,
+        seconds = (result['t_end_ns'] - result['t_start_ns']) / SECOND
+        return answer({'path': f'/cut/{name}.mcap', 'bytes': result['bytes'], 'messages': result['messages'], 'seconds': seconds,
                        'kept_s': KEPT_S})  # fmt: skip
 
     async def _run(self, robot: str, source: str, begin_ms: int, end_ms: int, out: Path) -> dict[str, Any]:
-        """What ``bag cut --json`` reports, or ``error``."""
+        """The output of ``bag cut --json``, or ``error``."""
         times = [f'{utc(at_ms * (SECOND // 1000)):%Y-%m-%dT%H:%M:%S.%f}Z' for at_ms in (begin_ms, end_ms)]
         await asyncio.to_thread(out.parent.mkdir, mode=0o700, exist_ok=True)
         process = await asyncio.create_subprocess_exec(
@@ -146,7 +146,7 @@ class Cuts:
             return {'error': visible(wrong.decode(errors='replace').strip()[-400:]) or 'nothing was cut'}
 
     def _forget(self, most: int = MAX_KEPT) -> None:
-        """Delete pieces that are old, and the oldest of too many."""
+        """Delete old pieces, and the oldest ones beyond the limit."""
         now_s = time.monotonic()
         for name, piece in list(self._pieces.items()):
             if now_s - piece.made_s >= KEPT_S or len(self._pieces) > most:
@@ -156,7 +156,7 @@ class Cuts:
     async def _piece(self, request: web.Request) -> web.StreamResponse:
         piece = self._pieces.get(request.match_info['name'])
         if piece is None:
-            return problem(404, 'this piece is not kept any more: cut it again')
+            return problem(404, 'this piece was deleted: cut it again')
         headers = {
             **SHARED,
             'Content-Type': 'application/octet-stream',

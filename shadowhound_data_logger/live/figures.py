@@ -1,4 +1,4 @@
-"""What the page says of the data: the node's status, the ledger and today's gaps, read from the spool and changing nothing."""
+"""The values that the page shows: the node's status, the ledger and today's gaps, read from the spool without changing it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _OF_STORE: Final = ('target', 'state', 'last_error', 'mbps', 'max_mbps', 'in_fli
 _OF_LEDGER: Final = ('received', 'stored', 'skipped', 'missed', 'missed_estimated', 'accounting')
 _OF_STATUS: Final = ('sensor', 'rate_hz', 'age_s', 'publishers', 'unavailable', 'may_be_silent')
 MAX_GAPS: Final = 4000
-"""Rows of the timeline; of more, neighbors of a topic and cause are one."""
+"""Maximum rows of the timeline; beyond it, neighboring gaps of a topic and cause are merged."""
 DAY_NS: Final = 24 * 3600 * SECOND
 
 
@@ -46,7 +46,7 @@ class SpoolFigures:
         self._problem = ''
 
     def now(self, *, with_ledger: bool) -> dict[str, Any]:
-        """What changes from second to second; the ledger's part anew only when it is asked for.
+        """The current values; with ``with_ledger`` also those of the ledger.
 
         ``topics``: received, stored, missed and so on as in ``ledger --json``, the rest as in ``status --json``.
         """
@@ -68,9 +68,9 @@ class SpoolFigures:
         }  # fmt: skip
 
     def gaps(self, since_ns: int | None = None, until_ns: int | None = None, by: str = BY_STAMP) -> dict[str, Any]:
-        """Every gap between two times (today's, unless they are given), and what the journal can say of each topic.
+        """All gaps between two times (by default today), and for which times they are known, per topic.
 
-        ``known``: [topic, since, until]; between them no row is no gap, beyond nobody knows yet. Times are UTC in ms.
+        ``known``: [topic, since, until]; within it no row means no gap, beyond it gaps are unknown. Times are UTC in ms.
         """
         now_ns = self._clock.wall_ns()
         midnight = utc(now_ns).replace(hour=0, minute=0, second=0, microsecond=0)
@@ -89,12 +89,12 @@ class SpoolFigures:
                 times := (mark.since_ns, mark.complete_ns) if is_by_stamp
                 else (mark.received_since_ns, mark.received_complete_ns), since_ns, until_ns)
         ]  # fmt: skip
-        return told_gaps(sorted(gaps, key=lambda gap: gap[4]), known, since_ns, until_ns, now_ns)
+        return gap_rows(sorted(gaps, key=lambda gap: gap[4]), known, since_ns, until_ns, now_ns)
 
 
-def told_gaps(gaps: Sequence[tuple[Any, ...]], known: Sequence[tuple[Any, ...]], since_ns: int, until_ns: int,
+def gap_rows(gaps: Sequence[tuple[Any, ...]], known: Sequence[tuple[Any, ...]], since_ns: int, until_ns: int,
               now_ns: int) -> dict[str, Any]:  # fmt: skip
-    """As ``SpoolFigures.gaps``, of gaps by time with the columns that it names, their times in ns."""
+    """As ``SpoolFigures.gaps``, from gaps sorted by time with its columns, times in ns."""
     grain_ns = (until_ns - since_ns) // MAX_GAPS if len(gaps) > MAX_GAPS else 0
     merged: dict[tuple[str, str, str, str], list[Any]] = {}
     shown: list[list[Any]] = []

@@ -1,6 +1,6 @@
-"""All robots of a store at a glance: when each was heard last, its last mission, what is missing today and how far that is known.
+"""Overview of all robots in a store: last contact, last mission, today's losses and how far these are known.
 
-Everything comes from the catalog and the gap journal. It needs the extra ``lake``.
+Everything is from the catalog and the gap journal. It needs the extra ``lake``.
 """
 
 from __future__ import annotations
@@ -25,50 +25,50 @@ from shadowhound_data_logger.spool.retention import NO_ROOM
 
 DAY_NS: Final = 24 * 3600 * SECOND
 RECENT_DAYS: Final = 7
-"""Of robots that were silent for longer only the day of their last object is known."""
+"""Of robots that were silent for longer, only the day of their last object is known."""
 SILENT_NS: Final = DAY_NS
 BEHIND_NS: Final = 600 * SECOND
-"""A robot whose account of losses is further behind its newest object has more to tell."""
+"""A robot whose gap reports are further behind its newest object still has some to send."""
 MAX_ROBOTS: Final = 2000
 MAX_TEXT: Final = 160
 BAD, WATCH, SILENT, GOOD = 'bad', 'watch', 'none', 'good'
 ORDER: Final = (BAD, WATCH, GOOD, SILENT)
-"""What needs a look comes first; a robot that is off is the last."""
+"""The most important first; a robot that is off is last."""
 HARMFUL: Final = frozenset({'dropped', 'rejected', 'quarantined', 'evicted'})
-"""Kinds of gaps of messages that the robot had and lost; others never reached it."""
+"""Kinds of gaps in which the robot lost messages that it had received; others never reached it."""
 
 
 @dataclass(slots=True)
 class RobotRow:
-    """What is known of one robot; times in ns, 0 for unknown."""
+    """What is known about one robot; times in ns, 0 for unknown."""
 
     robot: str
     last_ns: int = 0
-    """When its newest message in the store arrived at it, or its newest object begins."""
+    """Arrival of its newest message in the store at the robot, otherwise the start of its newest object."""
     last_date: str = ''
     mission: str = ''
     mission_type: str = ''
     mission_ns: int = 0
     known_ns: int = 0
-    """Up to here it has told what is missing."""
+    """Its gaps are known up to here."""
     lost: Counter[str] = field(default_factory=Counter)
     """Cause -> messages since midnight (UTC)."""
     harmful: int = 0
     no_room: int = 0
-    """Messages of today that were deleted because the disk or the spool was full."""
+    """Today's messages that were deleted because the disk or the spool was full."""
     quarantined: int = 0
-    """Messages of today that are in quarantine."""
+    """Today's messages in quarantine."""
 
     def state(self, now_ns: int) -> tuple[str, str]:
-        """How much it needs a look, and why."""
+        """Its state for the overview, and why."""
         if self.harmful:
-            return BAD, 'it lost data that it had'
+            return BAD, 'it lost data that it had received'
         if self.lost:
             return WATCH, 'messages are missing today'
         if not self.last_ns or now_ns - self.last_ns > SILENT_NS:
-            return SILENT, 'nothing came for more than a day'
+            return SILENT, 'nothing arrived for more than a day'
         if self.last_ns - self.known_ns > BEHIND_NS:
-            return WATCH, 'it has not told yet what is missing of its newest data'
+            return WATCH, 'it has not reported the gaps of its newest data yet'
         return GOOD, 'nothing is missing today'
 
     def to_json(self, now_ns: int) -> dict[str, Any]:
@@ -82,7 +82,7 @@ class RobotRow:
 
 
 def overview(source: Bucket, findings: Findings, now_ns: int | None = None) -> list[RobotRow]:
-    """Every robot of a store, those that need a look first. Raises StoreError, LakeError."""
+    """Every robot of a store, the most important first. Raises StoreError, LakeError."""
     now_ns = time.time_ns() if now_ns is None else now_ns
     found = {name: RobotRow(name) for name in robots(source)[:MAX_ROBOTS]}
     first = f'{utc(now_ns - RECENT_DAYS * DAY_NS):%Y-%m-%d}'
@@ -121,7 +121,7 @@ def _add(found: Mapping[str, RobotRow], each: Mapping[str, Any], midnight_ns: in
 
 
 def _text(text: str) -> str:
-    """For a page: bounded, and without control characters."""
+    """For a page: bounded, without control characters."""
     return visible(text[:MAX_TEXT])
 
 

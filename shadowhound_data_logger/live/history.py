@@ -1,8 +1,8 @@
-"""The process that reads the past for the live page: a timeline of a time, and what the robot saw at a moment of it.
+"""The process that reads the past for the live page: a timeline, and the state of the robot at a moment.
 
-It reads a request a line on its standard input and answers each on its standard output: two uint32 (little-endian) with the
-lengths of head and body, the head as JSON, the body. The live page starts it when somebody looks back, and ends it a minute
-after the last request. Whatever a hostile store does to it, the page goes on.
+It reads one request per line from standard input and answers on standard output: two uint32 (little-endian) with the lengths of
+head and body, the head as JSON, the body. The live page starts it when a user looks at the past, and ends it a minute after the
+last request. Whatever a hostile store does to it, the page continues.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem, clouds, fr
 from shadowhound_data_logger.live.past import (
     BAG_SENSOR,
     FRESH_S,
-    LONGEST_BATCH_NS,
+    MAX_BATCH_NS,
     MAX_BATTERY,
     PastContents,
     PastObject,
@@ -66,53 +66,53 @@ from shadowhound_data_logger.stores import open_store
 MAX_SPAN_NS: Final = 50 * 3600 * SECOND
 """Of a timeline."""
 RUNS: Final = 800
-"""A timeline is told this fine; and what follows within ``RHYTHM_NS`` is one run however fine it is."""
+"""Resolution of a timeline; objects within ``RHYTHM_NS`` are one run at any resolution."""
 RHYTHM_NS: Final = 5 * SECOND // 2
 LATE_NS: Final = 30 * SECOND
-"""What is delivered later than this after it was recorded is marked on the timeline."""
+"""Objects delivered later than this after they were recorded are marked on the timeline."""
 INFINITE_MS: Final = float('inf')
 STALE_NS: Final = 10 * SECOND
-"""What is older at a moment is not shown for it."""
+"""Maximum age of a value shown for a moment."""
 SERIES_NS: Final = 10 * SECOND
-"""So much before a moment the plots show."""
+"""Length of the plots before a moment."""
 PATH_NS: Final = 600 * SECOND
 RECENT_NS: Final = 30 * SECOND
-"""So much of plots is read for the live view where it left the spool already."""
+"""How much of plots is read from the store for the live view, if it has left the spool."""
 MAX_PLAN_CLOUDS: Final = 8
 PLAN_EVERY: Final = 8
-"""Every such point of the clouds by which the plan of the live view begins."""
+"""Every n-th point of the clouds that the plan of the live view starts with."""
 AROUND_NS: Final = 5 * SECOND
-"""Of a moment, on either side: what its commands ask for."""
+"""Range around a moment, on either side, for its commands."""
 LABELS_S: Final = 0.1
-"""A timeline waits so long for the labels in the store; the page asks again for those that took longer."""
+"""How long a timeline waits for the labels in the store; the page asks again for slower ones."""
 READING_LABELS: Final = 'the labels in the store are still being read'
 IN_BAG_NS: Final = 3 * SECOND // 2
-"""So much before a moment is read of a bag."""
+"""Range before a moment that is read of a bag."""
 BAG_BLOCK_NS: Final = SECOND // 2
-"""Of a bag so much is read together."""
+"""Block of a bag that is read together."""
 MAX_BAG_BYTES: Final = 64 << 20
-"""Of messages of bags that are kept."""
+"""Maximum bytes of cached messages of bags."""
 MESSAGE_BYTES: Final = 300
-"""What a message takes besides its content."""
+"""Memory of a message besides its content."""
 AHEAD_NS: Final = 2 * SECOND
-"""While moments follow one another, so much after the last one is read before it is asked for."""
+"""Range that is read ahead while moments follow one another."""
 MAX_TEXT: Final = 160
 MAX_MARKS: Final = 500
 MAX_OFFSETS: Final = 8
-"""Between stamp and arrival, in the messages about a moment."""
+"""Offsets between stamp and arrival, in the messages around a moment."""
 MAX_CUTS: Final = 3
-"""Commands that cut a bag."""
+"""Maximum commands that cut a bag."""
 MAX_COLUMNS: Final = 64
 MAX_MESSAGES: Final = 2000
 """Of a series at a moment; and of one object."""
 MAX_TOPICS: Final = 64
 MAX_MEMORY: Final = 6 << 30
-"""Address space of this process: a file that makes it ask for more ends it, and not the machine."""
+"""Address space of this process: a file that exceeds it ends this process, not the machine."""
 _CLOUD, _CAMERA = 'cloud', 'camera'
 
 
 class PastReader:
-    """Answers questions about the past, one at a time. Close once."""
+    """Answers requests about the past, one at a time. Close once."""
 
     def __init__(self, source: PastSource, kept: KeptSource, prefixes: Sequence[str] = ()) -> None:
         self._source, self._kept = source, kept
@@ -129,9 +129,9 @@ class PastReader:
         self._pool.shutdown()
         self._contents.close()
 
-    def answer(self, asked: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
-        """Head and body. Raises DataLoggerError, ValueError for what is no question."""
-        do, robot = asked.get('do'), asked.get('robot', '')
+    def answer(self, request: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
+        """Head and body. Raises DataLoggerError, ValueError for an invalid request."""
+        do, robot = request.get('do'), request.get('robot', '')
         if do == 'robots':
             return {'robots': self._source.robots()}, b''
         if do == 'fleet':
@@ -139,32 +139,34 @@ class PastReader:
         if not isinstance(robot, str) or not is_name(robot):
             raise ValueError('robot is the name of a robot')
         if do == 'moment':
-            return self.moment(robot, int(asked['at']) * 1_000_000, _clock(asked))
+            return self.moment(robot, int(request['at']) * 1_000_000, _clock(request))
         if do == 'recent':
             return self.recent(robot, time.time_ns())
         answers: dict[str, Callable[[], dict[str, Any]]] = {
             'days': lambda: {'days': self._source.days(robot)},
-            'timeline': lambda: self.timeline(robot, *_times(asked), _clock(asked), is_fitted=bool(asked.get('fit'))),
-            'range': lambda: self.range(robot, *_times(asked), _clock(asked)),
-            'label': lambda: self.label(robot, asked),
-            'kept': lambda: {'kept': {name: each.to_json() for name, each in offers(self._kept, robot, *_times(asked)).items()}},
+            'timeline': lambda: self.timeline(robot, *_times(request), _clock(request), is_fitted=bool(request.get('fit'))),
+            'range': lambda: self.range(robot, *_times(request), _clock(request)),
+            'label': lambda: self.label(robot, request),
+            'kept': lambda: {
+                'kept': {name: each.to_json() for name, each in offers(self._kept, robot, *_times(request)).items()}
+            },
             'requests': lambda: self.requests(robot),
-            'pull': lambda: self.pull(robot, asked),
+            'pull': lambda: self.pull(robot, request),
         }  # fmt: skip
         if do not in answers:
             raise ValueError(f'do is robots, moment, {", ".join(answers)}')
         return answers[do](), b''
 
-    def label(self, robot: str, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def label(self, robot: str, request: Mapping[str, Any]) -> dict[str, Any]:
         """Raises LabelRefused, LakeError, SettingError, StoreError."""
         if robot not in self._source.robots():
             raise LabelRefused(f'there is no robot {robot!r} here')
-        return {'id': self._labels.add(robot, asked)}
+        return {'id': self._labels.add(robot, request)}
 
-    # -- what is kept on the robot ---------------------------------------------------------------------------------
+    # -- objects kept on the robot ---------------------------------------------------------------------------------
 
     def requests(self, robot: str) -> dict[str, Any]:
-        """What is asked of a robot: ``sensor``, ``from`` and ``to`` (UTC in ms) instead of what each request wants.
+        """Requests to a robot: ``sensor``, ``from`` and ``to`` (UTC in ms) instead of the complete filter.
 
         Raises StoreError, LakeError, SpoolError.
         """
@@ -177,35 +179,35 @@ class PastReader:
                           'sensor': _text(want.get('sensor', '')), **times})  # fmt: skip
         return {'requests': found, 'mbps': self._kept.mbps(robot)}
 
-    def pull(self, robot: str, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Ask for a sensor's objects of a time, or take a request back. Raises as ``KeptSource.ask``, LakeError."""
-        by = re.sub(r'[^A-Za-z0-9_.-]', '_', str(asked['by']))
-        if 'cancel' in asked:
-            if all(one.id != asked['cancel'] for one in self._kept.requests(robot)):
-                raise PullRefused('there is no such request any more')
-            self._kept.cancel(robot, asked['cancel'], by)
-            return {'id': asked['cancel']}
-        begin_ns, end_ns = _times(asked)
-        sensor = str(asked['sensor'])
+    def pull(self, robot: str, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Request a sensor's objects of a time, or cancel a request. Raises as ``KeptSource.request``, LakeError."""
+        by = re.sub(r'[^A-Za-z0-9_.-]', '_', str(request['by']))
+        if 'cancel' in request:
+            if all(one.id != request['cancel'] for one in self._kept.requests(robot)):
+                raise PullRefused('this request does not exist any more')
+            self._kept.cancel(robot, request['cancel'], by)
+            return {'id': request['cancel']}
+        begin_ns, end_ns = _times(request)
+        sensor = str(request['sensor'])
         offered = offers(self._kept, robot, begin_ns, end_ns).get(sensor)
         if offered is None or not offered.objects:
-            raise PullRefused(f'{robot} keeps nothing of {visible(sensor)[:MAX_TEXT]} in this time')
+            raise PullRefused(f'{robot} keeps no data of {visible(sensor)[:MAX_TEXT]} in this time')
         return {'id': self._kept.ask(robot, KeptFilter(sensor=sensor, since_ns=begin_ns, until_ns=end_ns), by)}
 
-    # -- a time ----------------------------------------------------------------------------------------------------
+    # -- a time range ----------------------------------------------------------------------------------------------
 
     def timeline(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP, *, is_fitted: bool = False) -> dict[str, Any]:
-        """What was recorded between two times, the gaps, and what happened; ``by`` which of the two times of messages.
+        """What was recorded between two times, the gaps, and events; ``by`` is which of the two times of messages counts.
 
-        Missions, bags, events and labels have the robot's own time, which is that of arrival. ``is_fitted``: only of the part in
-        which something was recorded. ``recorded``: [topic, from, to]; ``kept`` the same of what is on the robot alone;
-        ``marks``: [kind, name, from, to, text]; ``deliveries``: [from, to, delivered or null] of what was not delivered soon;
-        ``battery``: [at, percent]; times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError,
-        DataLoggerError.
+        Missions, bags, events and labels have the robot's own time, which is that of arrival. ``is_fitted``: only the part in
+        which
+        something was recorded. ``recorded``: [topic, from, to]; ``kept``: the same for objects only on the robot;
+        ``marks``: [kind, name, from, to, text]; ``deliveries``: [from, to, delivered or null] of late deliveries; ``battery``:
+        [at, percent]; times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
         """
         grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
         runs = self._runs(robot, begin_ns, end_ns, grain_ns, by)
-        bags = list(self._marks_of_bags(robot, begin_ns, end_ns, by))
+        bags = list(self._bag_marks(robot, begin_ns, end_ns, by))
         kept = self._kept_runs(robot, begin_ns, end_ns, by)
         times = [*((run.begin_ns, run.end_ns) for run in runs), *(one[1:] for one in kept), *(mark[2:4] for mark in bags)]
         if is_fitted and times:
@@ -254,9 +256,9 @@ class PastReader:
         return list(_spans(kept, begin_ns, end_ns))
 
     def range(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
-        """What there is of a time, and the commands that get it. Raises ValueError, DataLoggerError.
+        """The data of a time range, and commands to get it. Raises ValueError, DataLoggerError.
 
-        ``bags``: [name, bytes of what covers the time, from, to], of those from which the time can be cut, by arrival.
+        ``bags``: [name, bytes of the slices that cover it, from, to], of the bags that can be cut, by arrival.
         """
         near = self._source.between(robot, begin_ns - PATH_NS, min(end_ns, begin_ns + PATH_NS), by)
         late = _offsets(near) if by == BY_STAMP else [0]
@@ -274,7 +276,7 @@ class PastReader:
             'commands': commands(robot, begin_ns, end_ns, list(bags), by, (min(late), max(late)), missions, is_kept=bool(kept)),
         }  # fmt: skip
 
-    def _marks_of_bags(self, robot: str, begin_ns: int, end_ns: int, by: str) -> Iterator[_Mark]:
+    def _bag_marks(self, robot: str, begin_ns: int, end_ns: int, by: str) -> Iterator[_Mark]:
         bags = self._source.bag_files(robot, begin_ns, end_ns, by)
         told = self._pool.map(self._contents.manifest, bags.values())
         for (bag, files), manifest in zip(bags.items(), told, strict=True):
@@ -289,18 +291,19 @@ class PastReader:
     # -- a moment --------------------------------------------------------------------------------------------------
 
     def moment(self, robot: str, at_ns: int, by: str = BY_STAMP) -> tuple[dict[str, Any], bytes]:
-        """What there is of a moment: the newest of each topic at or before it, as items, each after a uint32 with its length.
+        """The newest message of each topic at or before a moment, as items, each after a uint32 with its length.
 
-        ``by`` says by which of their two times messages are of the moment, and their age is measured. The head has ``shown``:
-        [topic, kind, ms before the moment, where it was read]. Raises DataLoggerError.
+        ``by`` is the time that decides, and that ages refer to. The head has ``shown``: [topic, kind, ms before the moment,
+        source].
+        Raises DataLoggerError.
         """
         walked = self._source.between(robot, at_ns - PATH_NS, at_ns + 1, by)
-        near = [one for one in walked if one.begin_ns >= at_ns - LONGEST_BATCH_NS]
+        near = [one for one in walked if one.begin_ns >= at_ns - MAX_BATCH_NS]
         late = _offsets(near) if by == BY_STAMP else [0]
         bag_files = {bag: files for late_ns in late for bag, files in
                      self._source.bag_files(robot, at_ns + late_ns - PATH_NS, at_ns + late_ns + 1, by).items()}  # fmt: skip
-        shown = self._of_objects(near, at_ns, by)
-        for item, where in self._of_bags(list(bag_files.values()), at_ns, by, late):
+        shown = self._object_items(near, at_ns, by)
+        for item, where in self._bag_items(list(bag_files.values()), at_ns, by, late):
             known = shown.get(item.topic)
             if known is None:
                 shown[item.topic] = item, where
@@ -321,10 +324,11 @@ class PastReader:
         return head, b''.join(len(item.packed).to_bytes(4, 'little') + item.packed for item in items)
 
     def recent(self, robot: str, now_ns: int) -> tuple[dict[str, Any], bytes]:
-        """What plots, path and plan of the live view begin with, as items like those of a moment.
+        """The initial plots, path and plan of the live view, as items like those of a moment.
 
-        Series of the last seconds; of longer ago only what is in the spool, and a cloud now and then. ``at`` is by the clock of
-        this machine that live items have. Raises DataLoggerError.
+        Series of the last seconds; earlier ones only from the spool, and a few clouds. ``at`` is by the clock of this machine, as
+        in live
+        items. Raises DataLoggerError.
         """
         walked = self._source.between(robot, now_ns - PATH_NS, now_ns + 1, BY_RECEIVED)
         by_topic: dict[str, list[PastObject]] = {}
@@ -347,7 +351,7 @@ class PastReader:
         return {'at': now_ns / 1e6}, b''.join(len(item.packed).to_bytes(4, 'little') + item.packed for item in items)
 
     def _read_ahead(self, robot: str, at_ns: int, by: str, bags: Sequence[Sequence[PastObject]], late: Sequence[int]) -> None:
-        """Of what plays or is scrubbed forward, the contents that come next, while the page shows this moment."""
+        """Read the next contents while the page shows this moment, if it plays or is scrubbed forward."""
         last_robot, last_ns, last_by = self._shown
         self._shown = robot, at_ns, by
         is_next = (robot, by) == (last_robot, last_by) and 0 < at_ns - last_ns <= AHEAD_NS
@@ -369,18 +373,18 @@ class PastReader:
 
         self._ahead = self._pool.submit(read)
 
-    def _of_objects(self, near: Sequence[PastObject], at_ns: int, by: str) -> dict[str, tuple[LiveItem, str]]:
+    def _object_items(self, near: Sequence[PastObject], at_ns: int, by: str) -> dict[str, tuple[LiveItem, str]]:
         chosen: dict[str, list[PastObject]] = {}
         for one in near:
             if '/rosbags/' not in one.key and '/missions/' not in one.key:
                 topic = one.topic or one.sensor
                 if topic in chosen or len(chosen) < MAX_TOPICS:
                     chosen.setdefault(topic, []).append(one)
-        found = self._pool.map(lambda pair: self._of_topic(pair[0], pair[1], at_ns, by), chosen.items())
+        found = self._pool.map(lambda pair: self._topic_item(pair[0], pair[1], at_ns, by), chosen.items())
         return {item[0].topic: item for item in found if item is not None}
 
-    def _of_topic(self, topic: str, objects: Sequence[PastObject], at_ns: int, by: str) -> tuple[LiveItem, str] | None:
-        """The newest of a topic that can be read."""
+    def _topic_item(self, topic: str, objects: Sequence[PastObject], at_ns: int, by: str) -> tuple[LiveItem, str] | None:
+        """The newest readable message of a topic."""
         last = objects[-1]
         extension = decode.extension_of(last.key)
         with suppress(DataLoggerError, *_BROKEN):
@@ -398,7 +402,7 @@ class PastReader:
                     return None
                 stamp_ns, newest = max(shown, key=lambda each: each[0])
                 body, extension = newest.body, newest.extension
-            if item := _picture(topic, extension, body, stamp_ns / 1e6):
+            if item := _image_item(topic, extension, body, stamp_ns / 1e6):
                 return item, _where(last)
         return None
 
@@ -427,19 +431,19 @@ class PastReader:
 
     # -- bags ------------------------------------------------------------------------------------------------------
 
-    def _of_bags(self, bag_files: Sequence[Sequence[PastObject]], at_ns: int, by: str,
+    def _bag_items(self, bag_files: Sequence[Sequence[PastObject]], at_ns: int, by: str,
                  late: Sequence[int]) -> list[tuple[LiveItem, str]]:  # fmt: skip
-        """Messages of a moment. Bags are sorted by arrival: with these offsets that is so much after the stamp."""
+        """Messages of a moment. Bags are sorted by arrival, which is later than the stamp by these offsets."""
         found: list[tuple[LiveItem, str]] = []
         for files in bag_files:
             manifest = self._contents.manifest(files)
             slices = {one.key: one for late_ns in late for one in _slices(files, manifest, at_ns + late_ns)}
             for one in slices.values():
                 with suppress(DataLoggerError, *_BROKEN):
-                    found += self._of_slice(one, at_ns, by, late)
+                    found += self._slice_items(one, at_ns, by, late)
         return found
 
-    def _of_slice(self, one: PastObject, at_ns: int, by: str, late: Sequence[int]) -> list[tuple[LiveItem, str]]:
+    def _slice_items(self, one: PastObject, at_ns: int, by: str, late: Sequence[int]) -> list[tuple[LiveItem, str]]:
         source, index = self._index(one)
         if index is None:
             return []
@@ -448,7 +452,7 @@ class PastReader:
         while waiting:
             late_ns = waiting.pop(0)
             read.add(late_ns)
-            slack_ns = SAME_NS if by == BY_STAMP else 0  # offsets that differ by less are the same
+            slack_ns = SAME_NS if by == BY_STAMP else 0  # offsets that differ by less are equal
             until_ns = at_ns + late_ns + slack_ns + 1
             for message in self._blocks.messages(
                 one.key, source, index, until_ns - IN_BAG_NS - 2 * slack_ns, until_ns, SERIES_NS
@@ -469,10 +473,10 @@ class PastReader:
         for (topic, type_name), messages in came.items():
             with suppress(Rejected, *_BROKEN):
                 ordered = [(message_ns / 1e6, messages[message_ns]) for message_ns in sorted(messages)]
-                found.append((self._of_messages(topic, type_name, ordered), _where(one)))
+                found.append((self._message_item(topic, type_name, ordered), _where(one)))
         return found
 
-    def _of_messages(self, topic: str, type_name: str, messages: Sequence[tuple[float, bytes]]) -> LiveItem:
+    def _message_item(self, topic: str, type_name: str, messages: Sequence[tuple[float, bytes]]) -> LiveItem:
         kind, (at_ms, cdr) = KINDS[type_name], messages[-1]
         if kind.name == _CLOUD:
             return next(clouds(topic, self._types, at_ms, cdr, (FULL,)))
@@ -481,13 +485,13 @@ class PastReader:
         return series(topic, kind, type_name, self._types, messages)
 
     def _read_index(self, one: PastObject) -> tuple[Ranged, McapIndex | None]:
-        """A file without a complete summary, which the node does not write, is not searched."""
+        """A file without a complete summary, which the node does not write, is skipped."""
         source = self._contents.ranged(one)
         return source, read_summary(source)
 
 
 class BagBlocks:
-    """Messages of bags, read in blocks of time: moments that follow one another read only what is new. Thread-safe."""
+    """Messages of bags, cached in blocks of time: consecutive moments only read new blocks. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -497,7 +501,7 @@ class BagBlocks:
     def messages(
         self, key: str, source: Ranged, index: McapIndex, begin_ns: int, end_ns: int, before_ns: int
     ) -> Iterator[RecordedMessage]:
-        """Of a time, and of ``before_ns`` before its end as far as that is here already. Raises BagDamaged, StoreError."""
+        """Messages of a time range, and of ``before_ns`` before its end if cached. Raises BagDamaged, StoreError."""
         first, last = begin_ns // BAG_BLOCK_NS, (end_ns - 1) // BAG_BLOCK_NS
         with self._lock:
             lacking = [number for number in range(first, last + 1) if (key, number) not in self._blocks]
@@ -529,19 +533,19 @@ def _size(messages: Sequence[RecordedMessage]) -> int:
 
 
 class PullRefused(DataLoggerError):
-    """What nobody can be asked for."""
+    """The data cannot be requested."""
 
     DEFAULT_REMEDY = 'choose another time or sensor'
 
 
 class LabelRefused(DataLoggerError):
-    """What is no label."""
+    """An invalid label."""
 
     DEFAULT_REMEDY = 'a label is a text on one line, for a time that ends after it begins'
 
 
 class PastLabels:
-    """The labels that stand in the store, and new ones. They are read beside the rest: a store that is away delays nothing."""
+    """The labels in the store, and new ones. They are read in parallel: an unreachable store delays nothing."""
 
     def __init__(self, pool: ThreadPoolExecutor) -> None:
         self._pool = pool
@@ -549,13 +553,13 @@ class PastLabels:
         self._known: dict[str, list[_Mark]] = {}
 
     def marks(self, robot: str) -> tuple[list[_Mark], str]:
-        """As they were read last, and why they are not known or old."""
+        """The labels as last read, and why they are unknown or outdated."""
         if find_spec('pyarrow') is None:
             return [], ''
         now_s = time.monotonic()
         since_s, reading = self._reading.get(robot, (-FRESH_S, None))
         if reading is None or (reading.done() and now_s - since_s > FRESH_S):
-            reading = self._pool.submit(_labels_of, robot)
+            reading = self._pool.submit(_read_labels, robot)
             self._reading[robot] = now_s, reading
         try:
             self._known[robot] = reading.result(LABELS_S)
@@ -565,14 +569,14 @@ class PastLabels:
             return self._known.get(robot, []), f'the labels in the store cannot be read: {error}'
         return self._known[robot], ''
 
-    def add(self, robot: str, asked: Mapping[str, Any]) -> str:
-        """Its id. Raises LakeError, SettingError, StoreError."""
+    def add(self, robot: str, request: Mapping[str, Any]) -> str:
+        """Returns its id. Raises LakeError, SettingError, StoreError."""
         if find_spec('pyarrow') is None:
             raise LakeError('labels need pyarrow', remedy='install the extra lake')
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415 - the extra lake
 
-        label, note, by = (str(asked[name]) for name in ('label', 'note', 'by'))
-        since_ns, until_ns = (int(asked[name]) * 1_000_000 for name in ('from', 'to'))
+        label, note, by = (str(request[name]) for name in ('label', 'note', 'by'))
+        since_ns, until_ns = (int(request[name]) * 1_000_000 for name in ('from', 'to'))
         try:
             one = labels.Label(robot=robot, label=label, since_ns=since_ns, until_ns=until_ns, note=note).checked()
         except SettingError as error:
@@ -583,7 +587,7 @@ class PastLabels:
         return one.id
 
 
-def _labels_of(robot: str) -> list[_Mark]:
+def _read_labels(robot: str) -> list[_Mark]:
     """Raises LakeError, StoreError, SettingError."""
     from shadowhound_data_logger.lake import labels  # noqa: PLC0415 - the extra lake
     from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
@@ -597,17 +601,17 @@ def _labels_of(robot: str) -> list[_Mark]:
 
 
 _Mark = tuple[str, str, int, int, str]
-"""Kind, name, begin and end in ns, what else there is to say."""
+"""Kind, name, start and end in ns, text."""
 _BROKEN: Final = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, MemoryError, OSError)
-"""What comes of content that is not what its name says."""
+"""Errors of content that does not match its name."""
 
 
 def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: str = BY_STAMP,  # noqa: PLR0913 - parts of commands
              late_ns: tuple[int, int] = (0, 0), missions: Sequence[str] = (), *,
              is_kept: bool = False) -> list[list[str]]:  # fmt: skip
-    """[what, command line] for this time, to be pasted into a shell: names of a store are quoted.
+    """[what, command line] for this time range, to paste into a shell: names from a store are quoted.
 
-    Bags are cut by arrival, which is at least and at most ``late_ns`` after the stamps.
+    Bags are cut by arrival, which is later than the stamps by ``late_ns`` (minimum, maximum).
     """
     since, until, start, end = (
         f'{utc(at_ns):%Y-%m-%dT%H:%M:%S.%f}'[:-3] + 'Z'
@@ -635,7 +639,7 @@ def _is_new(offset_ns: int, known: Iterable[int]) -> bool:
 
 
 def _offsets(objects: Sequence[PastObject]) -> list[int]:
-    """How much later than their stamps messages of some objects arrived: 0, and what differs from that by more than a second."""
+    """Distinct offsets from stamp to arrival of some objects: 0, and those that differ by more than a second."""
     found = [0]
     for one in objects:
         if len(found) < MAX_OFFSETS and _is_new(one.late_ns, found) and abs(one.late_ns) > SAME_NS:
@@ -644,23 +648,23 @@ def _offsets(objects: Sequence[PastObject]) -> list[int]:
 
 
 def _kept_times(row: Mapping[str, Any], by: str) -> tuple[int, int]:
-    """First and last of an object that is kept."""
+    """First and last time of a kept object."""
     start_ns, end_ns = row['t_start_ns'], row['t_end_ns'] or row['t_start_ns']
     if by == BY_RECEIVED and (received_ns := row['received_start_ns']) is not None:
         return received_ns, row['received_end_ns'] or received_ns
     return start_ns, end_ns
 
 
-def _clock(asked: Mapping[str, Any]) -> str:
+def _clock(request: Mapping[str, Any]) -> str:
     """Raises ValueError."""
-    if (by := asked.get('by', BY_STAMP)) not in CLOCKS:
+    if (by := request.get('by', BY_STAMP)) not in CLOCKS:
         raise ValueError(f'by is {" or ".join(CLOCKS)}')
     return str(by)
 
 
-def _times(asked: Mapping[str, Any]) -> tuple[int, int]:
+def _times(request: Mapping[str, Any]) -> tuple[int, int]:
     """``from`` and ``to`` in ns. Raises ValueError."""
-    begin_ns, end_ns = int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000
+    begin_ns, end_ns = int(request['from']) * 1_000_000, int(request['to']) * 1_000_000
     if not 0 < end_ns - begin_ns <= MAX_SPAN_NS:
         raise ValueError(f'a time has at most {MAX_SPAN_NS // SECOND // 3600} hours')
     return begin_ns, end_ns
@@ -693,7 +697,7 @@ def _slices(files: Sequence[PastObject], manifest: Manifest | None, at_ns: int, 
 
 
 def _joined(runs: Sequence[Run], grain_ns: int) -> list[tuple[str, int, int]]:
-    """(topic, from, to) of those that follow one another."""
+    """(topic, from, to) of consecutive runs, merged."""
     found: list[tuple[str, int, int]] = []
     for name, begin_ns, end_ns, *_ in runs:
         last = found[-1] if found else ('', 0, 0)
@@ -705,12 +709,12 @@ def _joined(runs: Sequence[Run], grain_ns: int) -> list[tuple[str, int, int]]:
 
 
 def _row(name: str, from_ns: int, to_ns: int, begin_ns: int, end_ns: int) -> list[Any]:
-    """For the page: within the time that is shown."""
+    """A row for the page, clipped to the visible time."""
     return [_text(name), round(max(from_ns, begin_ns) / 1e6, 1), round(min(to_ns, end_ns) / 1e6, 1)]
 
 
 def _deliveries(runs: Sequence[Run], grain_ns: int, now_ns: int) -> Iterator[tuple[int, int, int | None]]:
-    """(from, to, delivered) of times whose objects left the spool late; None while some of them wait."""
+    """(from, to, delivered) of times whose objects left the spool late; None if some still wait."""
     steps: dict[int, list[Any]] = {}
     for run in runs:
         step = steps.setdefault(run.begin_ns // grain_ns, [run.begin_ns, run.end_ns, 0, False])
@@ -729,7 +733,7 @@ def _deliveries(runs: Sequence[Run], grain_ns: int, now_ns: int) -> Iterator[tup
 
 
 def _shifted(item: LiveItem, offset_ms: float) -> LiveItem:
-    """A series with its times by another clock."""
+    """A series with its times converted to another clock."""
     head = item.head or {}
     times = np.frombuffer(item.body, '<f8', head['rows']) + offset_ms
     return LiveItem(item.topic, item.kind, head={**head, 'at': round(head['at'] + offset_ms, 1)},
@@ -737,7 +741,7 @@ def _shifted(item: LiveItem, offset_ms: float) -> LiveItem:
 
 
 def _after(before: LiveItem, item: LiveItem) -> LiveItem:
-    """A series of a bag, with what the objects have of the time before it: a plot keeps its range."""
+    """A series of a bag, extended with earlier rows from objects: a plot keeps its range."""
     head, old = item.head or {}, before.head or {}
     if 'rows' not in head or old.get('names') != head.get('names'):
         return item
@@ -750,7 +754,7 @@ def _after(before: LiveItem, item: LiveItem) -> LiveItem:
 
 
 def _track(poses: Sequence[tuple[int, tuple[float, float, float]]]) -> Iterator[LiveItem]:
-    """Where the robot went, by poses and the times that they are of (of a batch its middle)."""
+    """The robot's path, from poses and their times (the middle of a batch)."""
     ordered = sorted(poses, key=lambda each: each[0])
     if not ordered:
         return
@@ -758,7 +762,7 @@ def _track(poses: Sequence[tuple[int, tuple[float, float, float]]]) -> Iterator[
     yield LiveItem('', 'path', head={'points': len(places)}, body=places.tobytes())
 
 
-def _picture(topic: str, extension: str, body: bytes, at_ms: float) -> LiveItem | None:
+def _image_item(topic: str, extension: str, body: bytes, at_ms: float) -> LiveItem | None:
     if extension in decode.CLOUDS:
         table = decode.cloud(body)[:, :3]
         return next(points_items(topic, at_ms, table[:: len(table) // 200_000 + 1], 'odom', (FULL,)))
@@ -776,20 +780,20 @@ def _picture(topic: str, extension: str, body: bytes, at_ms: float) -> LiveItem 
 
 
 def _samples(body: bytes) -> tuple[str, list[dict[str, Any]]]:
-    """The type that a document names, and its messages."""
+    """The type named in a document, and its messages."""
     found = decode.records(body)
     told = json.loads(body).get('type')
     return told if isinstance(told, str) else '', found
 
 
 def _message_times(one: PastObject, stamps_ns: Sequence[int], by: str) -> list[int]:
-    """Those of the messages of an object."""
+    """The times of an object's messages."""
     times = np.array(stamps_ns, np.int64) + one.offset_ns
     return [int(each) for each in (decode.arrivals(times, one.begin_ns, one.end_ns) if by == BY_RECEIVED else times)]
 
 
 def _message(type_name: str, sample: Mapping[str, Any]) -> Any:
-    """A sample as the message that it was made of; the short document of odometry too (docs/formats.md)."""
+    """A sample as the original message, including the short document of odometry (docs/formats.md)."""
     if type_name == 'nav_msgs/msg/Odometry' and 'pose' not in sample:
         sample = {'pose': {'pose': {'position': sample['position'], 'orientation': sample['orientation']}}}
     return _space(sample)
@@ -804,9 +808,9 @@ def _space(value: Any) -> Any:
 
 
 def _checked(values: Mapping[Any, Any]) -> Mapping[str, float]:
-    """Raises ValueError for names that are none: those of joints are in the message."""
+    """Raises ValueError for invalid names: those of joints are in the message."""
     if len(values) > MAX_COLUMNS or not all(isinstance(name, str) and len(name) <= MAX_TEXT for name in values):
-        raise ValueError('too many figures, or their names are none')
+        raise ValueError('too many values, or invalid names')
     return {name: float(value) for name, value in values.items()}
 
 
@@ -820,12 +824,12 @@ def _text(text: str, most: int = MAX_TEXT) -> str:
 
 
 def main() -> None:
-    """Serve until the input ends. The arguments: the spool's folder and the robot; without them it is the store's past."""
+    """Serve until the input ends. The arguments: the spool's folder and the robot; without them it reads the store's past."""
     resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
     with suppress(OSError):
-        os.nice(10)  # whoever records goes first
+        os.nice(10)  # recording has priority
     out = os.fdopen(os.dup(1), 'wb')
-    os.dup2(2, 1)  # whatever prints does not answer
+    os.dup2(2, 1)  # print statements of libraries must not answer
     history: PastReader | None = None
     for line in sys.stdin.buffer:
         head: dict[str, Any]

@@ -1,4 +1,4 @@
-"""The child process that reads the past (``history.py``): started when somebody looks back, ended after an idle minute."""
+"""The child process that reads the past (``history.py``): started on the first request, ended after an idle minute."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from shadowhound_data_logger.core.errors import DataLoggerError
 
 IDLE_S: Final = 60.0
 ANSWER_S: Final = 45.0
-"""A question that takes longer ends the process."""
+"""A slower request ends the process."""
 MAX_WAITING: Final = 8
-"""Questions; who asks more is told to wait."""
+"""Maximum waiting requests; more are rejected."""
 MAX_ANSWER: Final = 96 << 20
 
 
 class PastUnavailable(DataLoggerError):
     """The past cannot be read now."""
 
-    DEFAULT_REMEDY = 'ask again in a moment'
+    DEFAULT_REMEDY = 'try again in a moment'
 
 
 class HistoryProcess:
-    """Asks the child, one question at a time. Used by one event loop; close once.
+    """Sends requests to the child, one at a time. Used by one event loop; close once.
 
     ``arguments`` are those of ``history.main``.
     """
@@ -43,23 +43,23 @@ class HistoryProcess:
 
     @property
     def pid(self) -> int | None:
-        """Of the process, while there is one."""
+        """The pid of the process, while there is one."""
         return self._process.pid if self._process is not None and self._process.returncode is None else None
 
-    async def ask(self, asked: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
+    async def ask(self, request: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
         """Head and body of the answer. Raises PastUnavailable."""
         if self._waiting >= MAX_WAITING:
-            raise PastUnavailable('too many ask for the past at once')
+            raise PastUnavailable('too many requests for the past at the same time')
         self._waiting += 1
         try:
             async with self._turn:
                 try:
-                    return await asyncio.wait_for(self._ask(asked), self._answer_s)
+                    return await asyncio.wait_for(self._ask(request), self._answer_s)
                 except (asyncio.TimeoutError, asyncio.IncompleteReadError, OSError, ValueError) as error:
                     await self._end()
                     raise PastUnavailable(f'the past could not be read: {type(error).__name__}') from error
                 except asyncio.CancelledError:
-                    await asyncio.shield(self._end())  # its answer would be the next one's
+                    await asyncio.shield(self._end())  # its answer would be taken for the next one's
                     raise
                 finally:
                     self._used_s = time.monotonic()
@@ -73,7 +73,7 @@ class HistoryProcess:
                 await self._ender
         await self._end()
 
-    async def _ask(self, asked: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
+    async def _ask(self, request: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
         process = self._process
         if process is None or process.returncode is not None:
             process = self._process = await asyncio.create_subprocess_exec(
@@ -85,7 +85,7 @@ class HistoryProcess:
                 self._ender = asyncio.create_task(self._end_when_idle())
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(json.dumps(dict(asked)).encode() + b'\n')
+        process.stdin.write(json.dumps(dict(request)).encode() + b'\n')
         await process.stdin.drain()
         sizes = await process.stdout.readexactly(8)
         head_size, body_size = int.from_bytes(sizes[:4], 'little'), int.from_bytes(sizes[4:], 'little')

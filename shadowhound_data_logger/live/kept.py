@@ -1,7 +1,7 @@
-"""What a robot keeps until somebody asks for it, and what is asked of it: by its spool, or by the catalog and its mailbox.
+"""Objects that a robot keeps until requested, and the requests: from its spool, or from the catalog and its mailbox.
 
-On the robot the index of its spool knows both, and the node is asked. On another machine they are in the store, which has to let
-this one replace the mailbox.
+On the robot the index of its spool has both, and requests are sent to the node. On another machine they are in the store, where
+this machine must be allowed to replace the mailbox.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.stores import open_store
 
 MAX_REQUESTS: Final = 20
-"""The newest ones are told."""
+"""The number of newest requests that are shown."""
 FRESH_S: Final = 10.0
-"""What the store says of a time is read again after so long."""
+"""How long data from the store is cached."""
 PACE_S: Final = 60.0
-"""The same of the pace of a robot."""
-LONGEST_SLICE_NS: Final = 3600 * SECOND
-"""A slice that began before a time may have messages of it."""
+"""The same for a robot's throughput."""
+MAX_SLICE_NS: Final = 3600 * SECOND
+"""A slice that starts this long before a time may have messages of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeptRequest:
-    """A request, as the page shows it."""
+    """A request, as shown on the page."""
 
     id: str
     by: str
@@ -56,22 +56,22 @@ class KeptRequest:
 
 
 class KeptSource(Protocol):
-    """What the page knows of what robots keep, and whom it asks for it."""
+    """The page's source of kept objects and requests."""
 
     is_recorded: bool
-    """Whether what is kept is among what the past has (``live/past.py``)."""
+    """Whether kept objects are included in the recorded runs (``live/past.py``)."""
 
     def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
-        """Of objects that are kept or lost, with what of them is in this time: columns of ``catalog.schema.KEPT``."""
+        """Objects that are kept or lost, with the part in this time: columns of ``catalog.schema.KEPT``."""
 
     def mbps(self, robot: str) -> float | None:
-        """The pace at which the robot uploads; None where it is not known."""
+        """The robot's upload throughput; None if unknown."""
 
     def requests(self, robot: str) -> list[KeptRequest]:
-        """The newest ones, the oldest of them first."""
+        """The newest requests, oldest first."""
 
     def ask(self, robot: str, want: KeptFilter, by: str) -> str:
-        """The id of the request."""
+        """Send a request; returns its id."""
 
     def cancel(self, robot: str, request: str, by: str) -> None: ...
 
@@ -86,7 +86,7 @@ def offers(source: KeptSource, robot: str, begin_ns: int, end_ns: int) -> dict[s
 
 
 class SpoolKept:
-    """Of one robot, by the index of its spool; its node is asked."""
+    """One robot, from the index of its spool; requests are sent to its node."""
 
     is_recorded = True
 
@@ -94,11 +94,9 @@ class SpoolKept:
         self._spool, self._robot = spool, robot
 
     def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
-        """Those that are kept. Raises SpoolError."""
+        """Kept objects. Raises SpoolError."""
         want = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
-        found = self._read(
-            lambda index: list(index.overview.recorded(robot, begin_ns - LONGEST_SLICE_NS, end_ns, state=State.KEPT))
-        )
+        found = self._read(lambda index: list(index.overview.recorded(robot, begin_ns - MAX_SLICE_NS, end_ns, state=State.KEPT)))
         return [
             {'key': key, 'sensor': sensor, 'topic': topic, 'bytes': size, 't_start_ns': start_ns, 't_end_ns': last_ns,
              'received_start_ns': received_ns, 'received_end_ns': received_end_ns, 'where': ON_ROBOT}
@@ -111,17 +109,17 @@ class SpoolKept:
 
     def requests(self, robot: str) -> list[KeptRequest]:
         """Raises SpoolError."""
-        return self._read(_of_index) if robot == self._robot else []
+        return self._read(_read_requests) if robot == self._robot else []
 
     def ask(self, robot: str, want: KeptFilter, by: str) -> str:
         """Raises NodeUnavailable, LakeError."""
-        return str(self._tell(robot, want=want.to_json(), by=by)['id'])
+        return str(self._request(robot, want=want.to_json(), by=by)['id'])
 
     def cancel(self, robot: str, request: str, by: str) -> None:
         """Raises NodeUnavailable, LakeError."""
-        self._tell(robot, cancel=request, by=by)
+        self._request(robot, cancel=request, by=by)
 
-    def _tell(self, robot: str, **arguments: Any) -> dict[str, Any]:
+    def _request(self, robot: str, **arguments: Any) -> dict[str, Any]:
         with closing(connect(self._spool, robot)) as connection:
             answer = connection.ask('pull', **arguments)
         if not answer['ok']:
@@ -139,12 +137,12 @@ class SpoolKept:
 
 
 class StoreKept:
-    """Of all robots, by the store that the environment names. It needs the extra ``lake``."""
+    """All robots in the store that the environment names. It needs the extra ``lake``."""
 
     is_recorded = False
 
     def __init__(self) -> None:
-        """Raises SettingError for settings of a store that are none."""
+        """Raises SettingError for invalid settings of a store."""
         from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415 - the extra lake
         from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
 
@@ -204,7 +202,7 @@ class StoreKept:
 _Answer = TypeVar('_Answer')
 
 
-def _of_index(index: Index) -> list[KeptRequest]:
+def _read_requests(index: Index) -> list[KeptRequest]:
     found = []
     for row in index.requests.rows()[-MAX_REQUESTS:]:
         sent, size = index.requested.progress(row.id).outcomes.get('delivered', (0, 0))

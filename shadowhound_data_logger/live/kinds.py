@@ -1,7 +1,8 @@
-"""What of a message the page shows: its type decides the kind, and the kind what is sent to a browser.
+"""What the page shows of a message: its type decides the kind, and the kind what is sent to the browser.
 
-A camera's frame goes as JPEG, a cloud as uint16 in its bounding box, everything else as rows of float32. Frames and clouds exist
-in three sizes (``FULL`` to ``SMALLEST``), for links that carry less. Raises Rejected for a message that is broken.
+A camera's frame is sent as JPEG, a cloud as uint16 in its bounding box, everything else as rows of float32. Frames and clouds
+exist
+in three sizes (``FULL`` to ``SMALLEST``), for slower links. Raises Rejected for an invalid message.
 """
 
 from __future__ import annotations
@@ -32,52 +33,54 @@ if TYPE_CHECKING:
 FULL, HALF, SMALLEST = 0, 1, 2
 SIZES: Final = (FULL, HALF, SMALLEST)
 _SIDE: Final = {HALF: 2, SMALLEST: 4}
-"""By how much a smaller frame's sides are divided."""
+"""The divisor of a smaller frame's sides."""
 _QUALITY: Final = {FULL: 75, HALF: 60, SMALLEST: 45}
 _EVERY: Final = {FULL: 1, HALF: 4, SMALLEST: 16}
-"""Which points of a smaller cloud are kept."""
+"""Every n-th point of a smaller cloud."""
 MAX_POINTS: Final = 200_000
-"""Of a cloud that is sent; of a larger one each second, third, ... is."""
+"""Maximum points of a cloud that is sent; larger ones are decimated."""
 _COLORSPACES: Final = {
     'bgr8': 'BGR', 'rgb8': 'RGB', 'bgra8': 'BGRA', 'rgba8': 'RGBA', 'mono8': 'GRAY', '8UC1': 'GRAY', '8UC3': 'BGR',
     '8UC4': 'BGRA',
 }  # fmt: skip
 _MEASURED: Final = {'16UC1': ('u2', 'm'), '32FC1': ('f4', 'm'), 'mono16': ('u2', '')}
-"""Images of distances (REP 118: millimeters as uint16, meters as float32) and of other values, shown in colors: numpy's name of a
-value, and the unit."""
+"""Images of distances (REP 118: millimeters as uint16, meters as float32) and of other values, shown in colors: numpy's name of
+the
+value type, and the unit.
+"""
 _RAMP: Final = ((250, 235, 110), (245, 150, 60), (220, 70, 90), (130, 40, 130), (50, 30, 110), (20, 25, 70))
 """Red, green and blue from near to far; ``page/style.css`` has the same for the legend."""
 _NO_VALUE: Final = (118, 118, 118)
 _ENDS: Final = tuple(
     step * ten for ten in (0.1, 1.0, 10.0, 100.0, 1000.0, 10_000.0) for step in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
 )
-"""Where the colors of such an image may end, so that they rarely change."""
+"""Possible upper ends of the color scale, so that it rarely changes."""
 _AXES: Final = ('x', 'y', 'z')
 MAX_NAMES, MAX_NAME = 64, 64
-"""Figures in a row, and letters in the name of one."""
+"""Maximum values in a row, and letters in the name of one."""
 _FAR: Final = 1e7
-"""Metres: no point of a robot's lidar is further from where its frame begins."""
+"""Meters: no point of a robot's lidar is further from the origin of its frame."""
 _NO_FIX: Final = -1
 _GO2_IMU_NAMES: Final = [*(f'{name}.{axis}' for name in ('rpy', 'gyro', 'accel') for axis in _AXES), 'temperature']
 _GO2_IMU_BYTES: Final = range(57, 61)
-"""A go2_interfaces/msg/IMU, serialized; some writers pad it."""
+"""Size of a serialized go2_interfaces/msg/IMU; some writers pad it."""
 _GO2_IMU: Final = struct.Struct('<20x9fb')
 """Its gyro, accel, rpy and temperature."""
 _GO2_IMU_ROW: Final = struct.Struct('<10f')
 _POSE_NAMES: Final = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
 _POSE, _POSE_ROW = struct.Struct('<7d'), struct.Struct('<7f')
 _ODOMETRY_BYTES: Final = 8 * (7 + 36 + 6 + 36)
-"""Of pose and twist, each with its covariance."""
+"""Size of pose and twist, each with its covariance."""
 _LITTLE: Final = 1
-"""The second byte of CDR that is little-endian."""
+"""The second byte of little-endian CDR."""
 _FRAME_ID: Final = 12
-"""Where it is in the CDR of a message that begins with a header."""
+"""Offset of the frame id in the CDR of a message that starts with a header."""
 _LENGTH: Final = struct.Struct('<I')
 
 
 @dataclass(frozen=True)
 class LiveItem:
-    """Something to be sent to whoever watches a topic; packed once for all of them."""
+    """Data for the viewers of a topic; packed once for all of them."""
 
     topic: str
     kind: str
@@ -99,23 +102,25 @@ class LiveItem:
 def _json(value: Mapping[str, Any]) -> bytes:
     try:
         return orjson.dumps(value)
-    except TypeError:  # half a surrogate in a name, or an integer of more than 64 bits
+    except TypeError:  # an unpaired surrogate in a name, or an integer of more than 64 bits
         return json.dumps(value, separators=(',', ':')).encode()
 
 
 class Kind(NamedTuple):
-    """How the messages of some types are shown."""
+    """How messages of some types are shown."""
 
     name: str
-    most_hz: float
-    """Messages beyond it are left out."""
+    max_hz: float
+    """Maximum rate; other messages are skipped."""
     is_bulk: bool
     """Whether only the newest one matters."""
     values: Callable[[Any], Mapping[str, float]] | None = None
-    """The figures of a message, where it goes as a row of them."""
+    """The values of a message, if it is sent as a row."""
     table: Callable[[Sequence[bytes]], tuple[list[str], bytes] | None] | None = None
-    """The same of serialized messages, read where little-endian CDR has it, which is several times as fast: names, and a row each
-    (float32). None, or an error of ``struct``, where they are not as usual."""
+    """The same for serialized messages, read from little-endian CDR, which is several times as fast: names, and a row each
+    (float32).
+    None, or an error of ``struct``, if the layout is unusual.
+    """
 
 
 def _turn(q: Any) -> tuple[float, float, float]:
@@ -134,7 +139,7 @@ def _named(prefix: str, values: Sequence[float]) -> Iterator[tuple[str, float]]:
 
 
 def _imu(message: Any) -> dict[str, float]:
-    """Without what the message marks as unknown, by -1 as the first element of the covariance (Imu.msg)."""
+    """Without values that the message marks as unknown, by -1 as the first element of the covariance (Imu.msg)."""
     found: dict[str, float] = {}
     rate, force = message.angular_velocity, message.linear_acceleration
     if message.orientation_covariance[0] != -1:
@@ -164,20 +169,20 @@ def _odometry(message: Any) -> dict[str, float]:
 
 
 def _after_text(cdr: bytes, place: int) -> int:
-    """Where a uint32 is that comes after the text at this place."""
+    """Offset of a uint32 that follows the text at this offset."""
     end = place + 4 + int(_LENGTH.unpack_from(cdr, place)[0])
     return end + -end % 4
 
 
-def _of_doubles(place: int) -> int:
-    """Where a float64 is that comes next: CDR aligns it from byte 4 on."""
+def _align_double(place: int) -> int:
+    """Offset of the next float64: CDR aligns it relative to byte 4."""
     return place + (4 - place) % 8
 
 
 def _odometry_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
     rows = []
     for cdr in cdrs:
-        place = _of_doubles(_after_text(cdr, _after_text(cdr, _FRAME_ID)))  # after child_frame_id
+        place = _align_double(_after_text(cdr, _after_text(cdr, _FRAME_ID)))  # after child_frame_id
         if cdr[1] != _LITTLE or len(cdr) < place + _ODOMETRY_BYTES:
             return None
         rows.append(_POSE_ROW.pack(*_POSE.unpack_from(cdr, place)))
@@ -200,11 +205,11 @@ def _joints_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
         for _ in range(count):
             place = _after_text(cdr, place)
         told = told or cdr[begin:place]
-        position = _of_doubles(place + 4)
+        position = _align_double(place + 4)
         lengths = []
         for _ in range(3):  # position, velocity, effort
             (length,) = _LENGTH.unpack_from(cdr, place)
-            place = _of_doubles(place + 4) + 8 * length if length else place + 4
+            place = _align_double(place + 4) + 8 * length if length else place + 4
             lengths.append(length)
         if lengths[0] < count or len(cdr) < place or not cdr.startswith(told, begin):
             return None
@@ -215,7 +220,7 @@ def _joints_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
 
 @lru_cache(maxsize=16)
 def _joint_names(told: bytes) -> list[str] | None:
-    """Of a sequence of text in CDR; None where two are the same."""
+    """Names in a sequence of strings in CDR; None if two are equal."""
     names, place = [], 4
     while place < len(told):
         (length,) = _LENGTH.unpack_from(told, place)
@@ -248,7 +253,7 @@ def _go2_state(message: Any) -> dict[str, float]:
 
 
 def _fix(message: Any) -> dict[str, float]:
-    """Degrees as a float32 and what it lacks: one alone is wrong by up to a meter. NaN without a fix."""
+    """Degrees as a float32 plus the remainder: one float32 is off by up to a meter. NaN without a fix."""
     has_fix = message.status.status != _NO_FIX
     latitude, longitude = (value if has_fix else math.nan for value in (message.latitude, message.longitude))
     lat, lon = float(np.float32(latitude)), float(np.float32(longitude))
@@ -272,11 +277,11 @@ KINDS: Final[Mapping[str, Kind]] = {
     'go2_interfaces/msg/Go2State': Kind('state', 10.0, is_bulk=False, values=_go2_state),
     'sensor_msgs/msg/NavSatFix': Kind('fix', 5.0, is_bulk=False, values=_fix),
 }
-"""By type of message, what is shown live and of the past; ``panels.py`` has more that is shown live."""
+"""By message type, live and past; ``panels.py`` has more that is only shown live."""
 
 
 def series(topic: str, kind: Kind, type_name: str, types: MessageTypes, messages: Sequence[tuple[float, bytes]]) -> LiveItem:
-    """Rows of figures from messages and when each came (ms): all times as float64, then a row of float32 for each."""
+    """Rows of values from messages and their arrival (ms): all times as float64, then a row of float32 for each."""
     values = kind.values
     assert values is not None
 
@@ -285,7 +290,7 @@ def series(topic: str, kind: Kind, type_name: str, types: MessageTypes, messages
 
     found = None
     if kind.table is not None:
-        with suppress(struct.error, IndexError, OverflowError):  # read by field, it says what is wrong
+        with suppress(struct.error, IndexError, OverflowError):  # read by field, which reports what is wrong
             found = kind.table([cdr for _, cdr in messages])
     if found is None:
         return table_item(topic, kind, [read(at_ms, cdr) for at_ms, cdr in messages])
@@ -293,7 +298,7 @@ def series(topic: str, kind: Kind, type_name: str, types: MessageTypes, messages
 
 
 def table_item(topic: str, kind: Kind, rows: Sequence[tuple[float, Mapping[str, float]]]) -> LiveItem:
-    """Times and figures as an item: all times as float64, then a row of float32 for each that names what the last one names."""
+    """Times and values as an item: all times as float64, then a row of float32 for each with the columns of the last one."""
     names = list(rows[-1][1])
     rows = [row for row in rows if list(row[1]) == names]
     table = np.array([list(values.values()) for _, values in rows], '<f4')
@@ -306,7 +311,7 @@ def _table_item(topic: str, kind: Kind, names: list[str], times: list[float], ta
 
 
 def frames(topic: str, type_name: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:
-    """A camera's message in each size that is asked for; a JPEG goes as it came. Raises Rejected."""
+    """A camera's message in each requested size; a JPEG is passed on unchanged. Raises Rejected."""
     if type_name == COMPRESSED_IMAGE:
         body = _compressed(types, cdr)
         check_jpeg(body)
@@ -329,8 +334,8 @@ def frames(topic: str, type_name: str, types: MessageTypes, at_ms: float, cdr: b
 
 
 def _compressed(types: MessageTypes, cdr: bytes) -> bytes:
-    """The JPEG of a CompressedImage, cut out where little-endian CDR has it. Raises Rejected."""
-    with suppress(struct.error, IndexError):  # it is no such message
+    """The JPEG of a CompressedImage, sliced from little-endian CDR. Raises Rejected."""
+    with suppress(struct.error, IndexError):  # it is another type of message
         begin = _after_text(cdr, _after_text(cdr, _FRAME_ID)) + 4  # after its format
         end = begin + int(_LENGTH.unpack_from(cdr, begin - 4)[0])
         if cdr[1] == _LITTLE and end <= len(cdr) < end + 4 and cdr.startswith(JPEG_MAGIC, begin):
@@ -338,12 +343,12 @@ def _compressed(types: MessageTypes, cdr: bytes) -> bytes:
     message = types.deserialize(COMPRESSED_IMAGE, memoryview(cdr))
     body: bytes = message.data.tobytes()
     if not body.startswith(JPEG_MAGIC):
-        raise Rejected('unsupported_encoding', f'{message.format[:40]!r} is shown by no browser')
+        raise Rejected('unsupported_encoding', f'{message.format[:40]!r} cannot be shown by browsers')
     return body
 
 
 def check_jpeg(jpeg: bytes) -> None:
-    """Raises Rejected for one that is broken, or of so many pixels that whoever shows it has no memory left."""
+    """Raises Rejected for an invalid JPEG, or one with so many pixels that a viewer runs out of memory."""
     try:
         height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
         check_pixels(width, height)
@@ -374,7 +379,7 @@ def _pixels(message: Any) -> tuple[NDArray[Any], str]:
 
 
 def _measured(message: Any, side: int) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Pixels of an image of values in colors, each of ``side`` rows and columns one, and the scale of the colors."""
+    """Pixels of an image of values in colors, one of ``side`` rows and columns, and the scale of the colors."""
     name, unit = _MEASURED[message.encoding]
     dtype = np.dtype(name).newbyteorder('>' if message.is_bigendian else '<')
     height, width, step = message.height, message.width, message.step
@@ -392,7 +397,7 @@ def _measured(message: Any, side: int) -> tuple[NDArray[Any], dict[str, Any]]:
 
 @lru_cache(maxsize=8)
 def _color_table(end: float) -> NDArray[Any]:
-    """The color of each uint16, up to ``end``; 0 means that there is no value."""
+    """The color of each uint16, up to ``end``; 0 means no value."""
     place = np.minimum(np.arange(65_536) / end, 1.0) * (len(_RAMP) - 1)
     table = np.stack([np.interp(place, range(len(_RAMP)), channel) for channel in zip(*_RAMP, strict=True)], axis=1)
     table[0] = _NO_VALUE
@@ -400,17 +405,17 @@ def _color_table(end: float) -> NDArray[Any]:
 
 
 def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:
-    """A cloud's finite points in each size that is asked for: x, y, z as uint16, meters are ``low + value * step``."""
+    """A cloud's finite points in each requested size: x, y, z as uint16, meters are ``low + value * step``."""
     cloud = types.deserialize(POINT_CLOUD, memoryview(cdr))
     xyz = xyz_of(cloud, max(1, -(-cloud.width * cloud.height // MAX_POINTS)))
     if xyz is None:
-        raise Rejected('size_mismatch', 'a cloud without x, y and z as float32, or with another number of bytes than it says')
+        raise Rejected('size_mismatch', 'a cloud without x, y and z as float32, or with a wrong number of bytes')
     yield from points_items(topic, at_ms, xyz, cloud.header.frame_id, sizes)
 
 
 def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, sizes: Sequence[int]) -> Iterator[LiveItem]:
-    """These points (n, 3; float32, meters) in each size that is asked for, without those that are not finite or absurdly far."""
-    columns = np.ascontiguousarray(table.T, '<f4')  # numpy is ten times as fast along rows that are contiguous
+    """These points (n, 3; float32, meters) in each requested size, without those that are not finite or absurdly far."""
+    columns = np.ascontiguousarray(table.T, '<f4')  # numpy is ten times as fast along contiguous rows
     low, high = _box(columns)
     if not (min(low) > -_FAR and max(high) < _FAR) or any(map(math.isnan, low)):
         is_near = (np.abs(columns) < _FAR).all(axis=0)
@@ -424,7 +429,7 @@ def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, size
         steps *= factor
         steps += np.float32(0.5)
         chosen = np.empty((sent.shape[1], 3), '<u2')
-        for axis, column in enumerate(steps):  # numpy takes twice as long to turn the whole table
+        for axis, column in enumerate(steps):  # numpy takes twice as long to transpose the complete table
             chosen[:, axis] = column
         head = {
             'at': round(at_ms, 1), 'low': [round(value, 4) for value in low], 'step': scale, 'points': len(chosen),
@@ -434,7 +439,7 @@ def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, size
 
 
 def _box(columns: NDArray[Any]) -> tuple[list[float], list[float]]:
-    """Least and greatest of each of three rows; zeros where they are empty, NaN where one of a row is."""
+    """Minimum and maximum of each of three rows; zeros if they are empty, NaN if a row contains one."""
     if not columns.size:
         return [0.0] * 3, [0.0] * 3
     return np.minimum.reduce(columns, axis=1).tolist(), np.maximum.reduce(columns, axis=1).tolist()

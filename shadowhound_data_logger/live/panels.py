@@ -1,7 +1,7 @@
-"""What of standard types the page draws besides pictures, clouds and plots: scans, maps, transforms, lists, the robot's model.
+"""Drawings of standard types besides images, clouds and plots: scans, maps, transforms, lists, the robot's model.
 
-Each type has a function of the newest message, or an object that collects messages of a topic. What they send is bounded
-whatever a message contains, and newer items replace older ones. Raises Rejected for a message that is broken.
+Each type has a function of the newest message, or an object that collects messages of a topic. Their output is bounded whatever a
+message contains, and newer items replace older ones. Raises Rejected for an invalid message.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.live.kinds import FULL, KINDS, Kind, LiveItem
 
 Messages = Sequence[tuple[float, bytes]]
-"""When each came (ms), and its CDR."""
+"""Arrival (ms) and CDR of each."""
 MAX_RAYS: Final = 4000
-"""Of a scan; of a larger one each second, third, ... is sent."""
+"""Maximum rays of a scan; larger ones are decimated."""
 MAX_CELLS: Final = 512
-"""Of a side of a map; a larger one is reduced."""
+"""Maximum cells per side of a map; larger ones are reduced."""
 _UNKNOWN: Final = 255
-"""A cell of a map, which otherwise has 0 to 100."""
+"""An unknown cell of a map; others are 0 to 100."""
 MAX_FRAMES: Final = 200
 MAX_STATUSES, MAX_VALUES = 200, 24
 """Of diagnostics, and of one of them."""
@@ -41,28 +41,28 @@ _LITTLE: Final = 1
 _LENGTH: Final = struct.Struct('<I')
 _TRANSFORM: Final = struct.Struct('<7d')
 _FIRST_HEADER: Final = 8
-"""Of a TFMessage in CDR, after encapsulation and length."""
+"""Offset of the first header of a TFMessage in CDR, after encapsulation and length."""
 
 
 class Maker(Protocol):
-    """Makes an item of the messages of one topic."""
+    """Creates an item from the messages of one topic."""
 
     def __call__(self, topic: str, types: MessageTypes, type_name: str, messages: Messages) -> LiveItem: ...
 
 
 class Panel(NamedTuple):
-    """How the messages of a type are drawn."""
+    """How messages of a type are drawn."""
 
     kind: Kind
     is_gathered: bool
     """Whether every message matters, and not only the newest one."""
     maker: Callable[[], Maker]
     is_latched: bool = False
-    """Whether publishers usually send it once, for all who come later."""
+    """Whether publishers usually send it once, for late subscribers."""
 
 
 def _scan(topic: str, types: MessageTypes, type_name: str, messages: Messages) -> LiveItem:
-    """Ranges as uint16: meters are ``value * step``; 0: nothing was measured there."""
+    """Ranges as uint16: meters are ``value * step``; 0: no measurement."""
     at_ms, cdr = messages[-1]
     message = types.deserialize(type_name, memoryview(cdr))
     every = max(1, -(-len(message.ranges) // MAX_RAYS))
@@ -83,7 +83,7 @@ def _scan(topic: str, types: MessageTypes, type_name: str, messages: Messages) -
 
 
 def _map(topic: str, types: MessageTypes, type_name: str, messages: Messages) -> LiveItem:
-    """Cells as uint8 (0 to 100, 255: unknown), deflated; of several cells that become one, the most occupied."""
+    """Cells as uint8 (0 to 100, 255: unknown), deflated; cells that are merged get their maximum occupancy."""
     at_ms, cdr = messages[-1]
     message = types.deserialize(type_name, memoryview(cdr))
     info, origin = message.info, message.info.origin
@@ -92,7 +92,7 @@ def _map(topic: str, types: MessageTypes, type_name: str, messages: Messages) ->
     if not width or not height or len(message.data) != width * height:
         raise Rejected('size_mismatch', f'a map of {width} x {height} cells with {len(message.data)} values')
     if not all(map(math.isfinite, numbers)) or resolution <= 0:
-        raise Rejected('malformed', 'a map without a resolution or a place')
+        raise Rejected('malformed', 'a map without a resolution or an origin')
     cells = np.asarray(message.data, np.int8).reshape(height, width)
     by = max(1, -(-max(width, height) // MAX_CELLS))
     if by > 1:
@@ -155,7 +155,7 @@ class _Frames:
         try:
             if len(cdr) > 8 and cdr[1] == _LITTLE:
                 return list(_transforms(cdr))
-        except (struct.error, IndexError):  # read by field, it says what is wrong
+        except (struct.error, IndexError):  # read by field, which reports what is wrong
             pass
         found: list[tuple[str, str, tuple[float, ...]]] = []
         for each in types.deserialize(type_name, memoryview(cdr)).transforms[:MAX_FRAMES]:
@@ -182,12 +182,12 @@ class _Statuses:
 
 
 def _level(level: Any) -> int:
-    """Of a DiagnosticStatus: ``byte``, which is a number or one byte."""
+    """The level of a DiagnosticStatus: ``byte``, which is a number or one byte."""
     return level[0] if isinstance(level, (bytes, bytearray)) else int(level)
 
 
 class _Lines:
-    """The last lines of the log: [when (ms), level, node, text]."""
+    """The last lines of the log: [time (ms), level, node, text]."""
 
     def __init__(self) -> None:
         self._lines: deque[list[Any]] = deque(maxlen=MAX_LINES)
@@ -214,15 +214,15 @@ PANELS: Final[Mapping[str, Panel]] = {
 MODEL: Final = Panel(Kind('model', 1.0, is_bulk=True), False, _stateless(_model), is_latched=True)
 _DESCRIPTION: Final = '/robot_description'
 BULK: Final = frozenset({*(panel.kind.name for panel in PANELS.values()), MODEL.kind.name})
-"""Kinds of which only the newest item counts, and which have one size."""
+"""Kinds with only one size, whose newest item alone counts."""
 
 
 def panel_of(topic: str, type_name: str) -> Panel | None:
-    """How a topic is drawn, if it is by this module."""
+    """How this module draws a topic, if it does."""
     return MODEL if type_name == 'std_msgs/msg/String' and topic.endswith(_DESCRIPTION) else PANELS.get(type_name)
 
 
 def kind_of(topic: str, type_name: str) -> Kind | None:
-    """How a topic is drawn, by whatever module; None if it is not."""
+    """How any module draws a topic; None if none does."""
     panel = panel_of(topic, type_name)
     return KINDS.get(type_name) if panel is None else panel.kind

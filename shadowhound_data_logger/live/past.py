@@ -1,8 +1,8 @@
-"""What a robot recorded on a day, and the bytes of it: by the index of its spool, or by the catalog in the store.
+"""What a robot recorded on a day, and its content: from the index of its spool, or from the catalog in the store.
 
-On the robot the spool's index knows what waits and what was delivered in the last weeks; what left the spool is read from the
-store. On another machine the catalog says all of it. Everything that comes out of a store is somebody else's: keys must be
-paths, sizes are bounded, texts are only ever shown.
+On the robot the spool's index has waiting objects and those delivered in the last weeks; content that left the spool is read from
+the store. On another machine everything is from the catalog. Data from a store is not trusted: keys must be paths, sizes are
+bounded, texts are only displayed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, MAX_OBJEC
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Ranged, StoredFile
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.formats.rows.gaps import GAP
-from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, told_gaps
+from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, gap_rows
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import STATES_IN_SPOOL
@@ -46,23 +46,23 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.stores.base import ObjectStore
 
 MAX_ROWS: Final = 1_500_000
-"""Of a day: a robot that stores every message of everything makes some 600,000."""
+"""Of a day: a robot that stores every message has some 600,000."""
 MAX_DAYS_KEPT: Final = 3
 FRESH_S: Final = 10.0
-"""A time that has just passed is read again after so long."""
+"""How long a recent time is cached."""
 SETTLED_S: Final = 300.0
-"""The same of an older one: some of it may still arrive."""
-LONGEST_BATCH_NS: Final = 15 * SECOND
+"""The same for an older one: objects may still arrive."""
+MAX_BATCH_NS: Final = 15 * SECOND
 BLOCK_NS: Final = 60 * SECOND
-"""Of a spool so much is read together."""
+"""Block of a spool that is read together."""
 MAX_BLOCKS: Final = 60
-"""Of those that are kept, each with some 1,000 objects."""
+"""Maximum cached blocks, each with some 1,000 objects."""
 MAX_MISSIONS: Final = 1000
 MAX_BATTERY: Final = 800
 """Points of the battery's line on a timeline."""
 BAG_SENSOR: Final = 'bag'
 KEPT_BYTES: Final = 48 << 20
-"""Of contents that were read: neighbouring moments are of the same objects."""
+"""Cache of contents: neighboring moments use the same objects."""
 MAX_BAGS: Final = 200
 """Of a day."""
 _COLUMNS: Final = ('bucket', 'key', 'sensor', 'topic', 'type', 'bytes', 't_start_ns', 't_end_ns', 'mission_id', 'mission_type',
@@ -71,13 +71,13 @@ _COLUMNS: Final = ('bucket', 'key', 'sensor', 'topic', 'type', 'bytes', 't_start
 
 @dataclass(frozen=True)
 class PastObject:
-    """An object as it is known here."""
+    """An object in the past."""
 
     bucket: str
     key: str
     sensor: str
     topic: str
-    """Empty where nobody knows it."""
+    """Empty if unknown."""
     type: str
     size: int
     begin_ns: int
@@ -88,18 +88,18 @@ class PastObject:
     """x, y, yaw."""
     battery: float | None = None
     late_ns: int = 0
-    """How much later than their stamps its messages arrived."""
+    """Delay of arrival after the stamps of its messages."""
     offset_ns: int = 0
-    """To be added to the times in its content."""
+    """Offset to add to the times in its content."""
     path: str = ''
-    """Of its file in the spool; empty for what lies in the store alone."""
+    """Its file in the spool; empty for objects only in the store."""
 
 
 class PastDay:
-    """The rows of a catalog of the objects that begin on one day, by time."""
+    """Catalog rows of the objects that start on one day, sorted by time."""
 
     def __init__(self, rows: Any, problem: str = '') -> None:
-        """``rows`` is a table of pyarrow with ``_COLUMNS``, sorted by ``t_start_ns``."""
+        """``rows`` is a pyarrow table with ``_COLUMNS``, sorted by ``t_start_ns``."""
         import pyarrow as pa  # noqa: PLC0415 - the extra lake
         import pyarrow.compute as pc  # noqa: PLC0415
 
@@ -111,7 +111,7 @@ class PastDay:
         self._names = [str(name) for name in names.dictionary.to_pylist()]
 
     def runs(self, begin_ns: int, end_ns: int, grain_ns: int) -> Iterator[Run]:
-        """Those in which no pause is longer than ``grain_ns``."""
+        """Runs without a pause longer than ``grain_ns``."""
         inside = (self.begins < end_ns) & (self.ends >= begin_ns)
         codes, begins, ends = self._codes[inside], self.begins[inside], self.ends[inside]
         for code, name in enumerate(self._names):
@@ -131,9 +131,9 @@ class PastDay:
         return [(int(self.begins[low + place]), float(column[place])) for place in known[:: len(known) // MAX_BATTERY + 1]]
 
     def between(self, begin_ns: int, end_ns: int) -> list[PastObject]:
-        """Those that begin in this time."""
+        """Objects that start in this time."""
         low, high = (int(np.searchsorted(self.begins, at_ns)) for at_ns in (begin_ns, end_ns))
-        return [_of_catalog(row) for row in self._rows.slice(low, max(0, high - low)).to_pylist()]
+        return [_from_catalog(row) for row in self._rows.slice(low, max(0, high - low)).to_pylist()]
 
     @cached_property
     def missions(self) -> list[PastMission]:
@@ -151,24 +151,24 @@ class PastDay:
         import pyarrow.compute as pc  # noqa: PLC0415 - the extra lake
 
         chosen = self._rows.filter(pc.match_substring(self._rows['key'], '/rosbags/'))
-        return _by_bag([_of_catalog(row) for row in chosen.to_pylist()])
+        return _by_bag([_from_catalog(row) for row in chosen.to_pylist()])
 
 
 class Run(NamedTuple):
-    """Objects of one topic that follow one another, or a part of them."""
+    """Consecutive objects of one topic, or a part of them."""
 
     name: str
-    """The topic, or the sensor where nobody knows the topic."""
+    """The topic, or the sensor if the topic is unknown."""
     begin_ns: int
     end_ns: int
     settled_ns: int | None = None
-    """When they left the spool; None where that is unknown."""
+    """When they left the spool; None if unknown."""
     waits: bool = False
     """Whether some of them are in the spool."""
 
 
 class PastMission(NamedTuple):
-    """What is known of a mission's time."""
+    """The known times of a mission."""
 
     id: str
     type: str
@@ -177,45 +177,45 @@ class PastMission(NamedTuple):
 
 
 class PastSource(Protocol):
-    """Where the past is read."""
+    """A source of the past."""
 
     def robots(self) -> list[str]: ...
 
     def fleet(self) -> list[dict[str, Any]]:
-        """All robots at a glance (``live/fleet.py``), those that need a look first; empty on a robot."""
+        """Overview of all robots (``live/fleet.py``), the most important first; empty on a robot."""
 
     def days(self, robot: str) -> list[str]:
-        """Dates with something recorded, ``YYYY-MM-DD``."""
+        """Dates with recorded data, ``YYYY-MM-DD``."""
 
     def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
-        """What was recorded in this time, by stamps or by the arrival of messages; pauses below ``grain_ns`` may be missing.
+        """What was recorded in this time, by stamps or by arrival of messages; pauses below ``grain_ns`` may be missing.
 
-        Of each topic in the order of time; runs of a topic may meet.
+        Sorted by time per topic; runs of a topic may touch.
         """
 
     def missions(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastMission]:
-        """Those of this time, as far as they are known after ``runs`` of it."""
+        """Missions in this time, as far as known after ``runs`` was called for it."""
 
     def battery(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[tuple[int, float]]:
-        """(time, percent) in this time, as far as it is known after ``runs`` of it."""
+        """(time, percent) in this time, as far as known after ``runs`` was called for it."""
 
     def between(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastObject]:
-        """Objects that begin in this time, in its order."""
+        """Objects that start in this time, in order."""
 
     def bag_files(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, list[PastObject]]:
-        """Files of bags that begin on the dates of this time, by bag."""
+        """Files of bags that start on the dates of this time, by bag."""
 
     def problem(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> str:
-        """What of this time cannot be read; empty if all of it can."""
+        """What cannot be read of this time; empty if everything can."""
 
     def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """As ``SpoolFigures.gaps``."""
 
 
 class PastContents:
-    """The bytes of objects, from the spool or the store, whichever has them. Keeps what it read last.
+    """The content of objects, from the spool or the store, whichever has it. Caches the last ones.
 
-    Thread-safe but for ``close``.
+    Thread-safe except for ``close``.
     """
 
     def __init__(self) -> None:
@@ -228,7 +228,7 @@ class PastContents:
         """Raises SettingError."""
         if self._store is None:
             settings = store_settings(os.environ, home(os.environ))
-            is_light = settings.endpoint_url and find_spec('obstore') is None  # a robot has boto3 alone
+            is_light = settings.endpoint_url and find_spec('obstore') is None  # a robot only has boto3
             self._store = open_store(settings, UploadSettings()) if is_light else open_reader(settings)
         return self._store
 
@@ -237,7 +237,7 @@ class PastContents:
             self._store.close()
 
     def get(self, one: PastObject, most: int = MAX_OBJECT_BYTES) -> bytes:
-        """Raises StoreError, LakeError for a key that is none."""
+        """Raises StoreError, LakeError for an invalid key."""
         kept = self._kept.get(one.key)
         if kept is not None:
             return kept
@@ -260,7 +260,7 @@ class PastContents:
         return self.store.get(one.bucket, one.key, most)
 
     def ranged(self, one: PastObject) -> Ranged:
-        """The file, to be read in pieces. Raises BagDamaged, LakeError."""
+        """The file, for reading in pieces. Raises BagDamaged, LakeError."""
         if one.path and os.path.isfile(one.path):  # noqa: PTH113 - never raises
             return LocalFile(Path(one.path))
         if not is_path(one.key):
@@ -268,7 +268,7 @@ class PastContents:
         return StoredFile(self.store, one.bucket, one.key, one.size)
 
     def manifest(self, files: Sequence[PastObject]) -> Manifest | None:
-        """What a bag says of itself; None while it is not whole, or where that cannot be read."""
+        """The manifest of a bag; None while the bag is incomplete, or if it is unreadable."""
         one = next((file for file in files if file.key.endswith(f'/{MANIFEST}')), None)
         if one is None:
             return None
@@ -279,7 +279,7 @@ class PastContents:
 
 
 class SpoolPast:
-    """One robot's past, by the index of its spool."""
+    """One robot's past, from the index of its spool."""
 
     def __init__(self, spool: Path, robot: str) -> None:
         self._spool, self._robot = spool, robot
@@ -302,7 +302,7 @@ class SpoolPast:
             return [f'{utc(number * DAY_NS):%Y-%m-%d}' for number in index.overview.recorded_days(robot)]
 
     def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
-        """Looks at the first and the last object of each ``grain_ns`` only. Raises SpoolError."""
+        """Reads only the first and the last object of each ``grain_ns``. Raises SpoolError."""
         found: list[Run] = []
         self._battery = []
         with closing(self._index()) as index, _reading(self._spool):
@@ -314,7 +314,7 @@ class SpoolPast:
     def _runs_of_sensor(self, index: Index, robot: str, sensor: str, begin_ns: int, end_ns: int, grain_ns: int,
                         by: str) -> Iterator[Run]:  # fmt: skip
         edge = partial(index.overview.edge, robot, sensor, by=by)
-        at_ns = begin_ns - LONGEST_BATCH_NS
+        at_ns = begin_ns - MAX_BATCH_NS
         while at_ns < end_ns and (first := edge(at_ns, end_ns, is_last=False)) is not None:
             at_ns = first[0] + grain_ns
             both = first, edge(first[0], min(at_ns, end_ns), is_last=True) or first
@@ -344,7 +344,7 @@ class SpoolPast:
                 if (of, clock) == (robot, by) and one.end_ns >= begin_ns and one.begin_ns <= end_ns]  # fmt: skip
 
     def between(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastObject]:
-        """Read by blocks, which neighboring moments share. Raises SpoolError."""
+        """Read in blocks, which neighboring moments share. Raises SpoolError."""
         numbers = range(begin_ns // BLOCK_NS, (max(begin_ns, end_ns - 1)) // BLOCK_NS + 1)
         now_s, now_ns = time.monotonic(), self._clock.wall_ns()
         lacking = []
@@ -370,7 +370,7 @@ class SpoolPast:
     def _read(self, robot: str, begin_ns: int, end_ns: int, by: str) -> list[PastObject]:
         with closing(self._index()) as index, _reading(self._spool):
             sensors = [sensor for sensor in index.overview.sensors() if sensor != BAG_SENSOR]
-            found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, sensors)]
+            found = [self._from_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, sensors)]
         return sorted(found, key=lambda one: one.begin_ns)
 
     def bag_files(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, list[PastObject]]:
@@ -390,14 +390,14 @@ class SpoolPast:
     def _read_bags(self, robot: str, begin_ns: int, by: str) -> list[PastObject]:
         end_ns = begin_ns + DAY_NS
         with closing(self._index()) as index, _reading(self._spool):
-            return [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, [BAG_SENSOR])]
+            return [self._from_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, [BAG_SENSOR])]
 
     def problem(self, *_: object) -> str:
-        """Nothing: an index that cannot be read is an error."""
+        """Empty: an unreadable index is an error."""
         return ''
 
-    def _of_row(self, row: tuple[Any, ...], by: str) -> PastObject:
-        """Of a row of ``OverviewTable.recorded``."""
+    def _from_row(self, row: tuple[Any, ...], by: str) -> PastObject:
+        """From a row of ``OverviewTable.recorded``."""
         (bucket, key, state, reason, sensor, topic, kind, size, begin_ns, end_ns, received_ns, received_end_ns, mission,
          mission_type, pose, battery, content) = row  # fmt: skip
         late_ns = 0 if received_ns is None else received_ns - begin_ns
@@ -416,7 +416,7 @@ class SpoolPast:
         return SpoolFigures(self._spool, robot, self._clock).gaps(begin_ns, end_ns, by)
 
     def _index(self) -> Index:
-        """Raises SpoolError where there is none."""
+        """Raises SpoolError if there is none."""
         path = self._spool / 'index.db'
         if not path.is_file():
             raise SpoolError(f'there is no spool in {self._spool}', remedy='has the node run here?')
@@ -426,10 +426,10 @@ class SpoolPast:
 
 
 class StorePast:
-    """The past of all robots whose catalog is in the store that the environment names. It needs the extra ``lake``."""
+    """The past of all robots with a catalog in the store that the environment names. It needs the extra ``lake``."""
 
     def __init__(self) -> None:
-        """Raises LakeError where pyarrow is not installed, SettingError for settings of a store that are none."""
+        """Raises LakeError without pyarrow, SettingError for invalid settings of a store."""
         if find_spec('pyarrow') is None:
             raise LakeError('the past of a store needs pyarrow', remedy='install the extra lake')
         from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415 - the extra lake
@@ -461,7 +461,7 @@ class StorePast:
 
     def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
         """Raises StoreError."""
-        days = self._days(robot, begin_ns - LONGEST_BATCH_NS, end_ns, by)
+        days = self._days(robot, begin_ns - MAX_BATCH_NS, end_ns, by)
         return sorted(run for day in days for run in day.runs(begin_ns, end_ns, grain_ns))
 
     def missions(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastMission]:
@@ -498,7 +498,7 @@ class StorePast:
         return [self._day(robot, date, by) for date in dates_between(begin_ns, end_ns)]
 
     def _day(self, robot: str, date: str, by: str) -> PastDay:
-        """As it was read, again after a while: it may go on, and older days still arrive."""
+        """The cached day, read again after a while: it may continue, and older days still get objects."""
         name, now_s = f'{robot} {date} {by}', time.monotonic()
         known = self._kept.get(name)
         fresh_s = FRESH_S if date_ns(date) + 2 * DAY_NS > time.time_ns() else SETTLED_S
@@ -522,7 +522,7 @@ class StorePast:
                         columns=_COLUMNS, order='t_start_ns, key', limit=MAX_ROWS, by=by)  # fmt: skip
         left = [f'{one.key}: {one.why}' for one in findings][:3]
         problem = f'{len(findings)} parts of the catalog cannot be read, such as {left[0]}' if left else ''
-        return PastDay(table, problem or ('this is not all of the day' if len(table) >= MAX_ROWS else ''))
+        return PastDay(table, problem or ('this day is incomplete' if len(table) >= MAX_ROWS else ''))
 
     def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """Raises StoreError."""
@@ -540,19 +540,19 @@ class StorePast:
             if row['sink'] == journal.OBJECTS and row['grade'] != journal.RECEIVED_ONLY
             and row['to_ns'] >= begin_ns and row['from_ns'] <= end_ns
         ]  # fmt: skip
-        return told_gaps(sorted(gaps, key=lambda gap: gap[4]), known, begin_ns, end_ns, time.time_ns())
+        return gap_rows(sorted(gaps, key=lambda gap: gap[4]), known, begin_ns, end_ns, time.time_ns())
 
 
 # -- parts ---------------------------------------------------------------------------------------------------------
 
 
 def date_ns(date: str) -> int:
-    """Where a date begins, UTC. Raises ValueError."""
+    """Start of a date, UTC. Raises ValueError."""
     return int(datetime.strptime(date, '%Y-%m-%d').replace(tzinfo=timezone.utc).timestamp()) * SECOND
 
 
 def dates_between(begin_ns: int, end_ns: int) -> list[str]:
-    """The dates that a time touches."""
+    """The dates that a time overlaps."""
     first, last = utc(begin_ns).date(), utc(max(begin_ns, end_ns - 1)).date()
     return [str(first + timedelta(days=number)) for number in range((last - first).days + 1)]
 
@@ -566,7 +566,7 @@ def _reading(spool: Path) -> Iterator[None]:
 
 
 def _is_bookkeeping(name: str) -> bool:
-    """Whether a sensor has no data of the robot: bags have their own marks."""
+    """Whether a sensor has no data of the robot: bags are marked separately."""
     return not name or name in {BAG_SENSOR, 'missions'} or name.startswith('_')
 
 
@@ -580,7 +580,7 @@ def _by_bag(files: Iterable[PastObject]) -> dict[str, list[PastObject]]:
 
 
 def consecutive(numbers: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """First and last of those that follow one another."""
+    """First and last of each run of consecutive numbers."""
     for place, number in enumerate(numbers):
         if not place or numbers[place - 1] != number - 1:
             first = number
@@ -588,7 +588,7 @@ def consecutive(numbers: Sequence[int]) -> Iterator[tuple[int, int]]:
             yield first, number
 
 
-def _of_catalog(row: Mapping[str, Any]) -> PastObject:
+def _from_catalog(row: Mapping[str, Any]) -> PastObject:
     pose = (row['x'], row['y'], row['yaw']) if None not in (row['x'], row['y'], row['yaw']) else None
     return PastObject(
         row['bucket'], row['key'], row['sensor'] or '', row['topic'] or '', row['type'] or '', row['bytes'], row['t_start_ns'],

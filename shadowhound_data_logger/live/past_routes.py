@@ -21,11 +21,11 @@ from shadowhound_data_logger.live.history_process import HistoryProcess, PastUna
 
 
 class PastRoutes:
-    """What was recorded and lost, of the robot of the page and of others in a store. Used by one event loop. Close it once."""
+    """Recordings and gaps, of the robot of the page and of others in a store. Used by one event loop. Close it once."""
 
     def __init__(self, history: HistoryProcess, figures: SpoolFigures, pool: Executor, reading: asyncio.Lock, robot: str, *,
                  is_of_store: bool) -> None:  # fmt: skip
-        """``reading`` serializes what is read of the spool."""
+        """``reading`` serializes reads of the spool."""
         self.history = history
         self._figures, self._pool, self._reading = figures, pool, reading
         self._robot, self._is_of_store = robot, is_of_store
@@ -40,7 +40,7 @@ class PastRoutes:
         await self.history.close()
 
     async def ask(self, do: str, robot: str, more: Mapping[str, Any]) -> web.StreamResponse:
-        """The answer of the child: JSON, or for a moment its head as JSON and its items, each after a uint32 with its length."""
+        """The child's answer: JSON, or for a moment its head as JSON and its items, each after a uint32 with its length."""
         try:
             head, body = await self.history.ask({'do': do, 'robot': robot, **more})
         except PastUnavailable as error:
@@ -61,7 +61,7 @@ class PastRoutes:
         except ValueError as error:
             return problem(400, str(error))
         if self._is_of_store:
-            return await self._gaps_of_store(times)
+            return await self._store_gaps(times)
         try:
             async with self._reading:
                 read = partial(self._figures.gaps, times[0], times[1])
@@ -69,7 +69,7 @@ class PastRoutes:
         except DataLoggerError as error:
             return problem(503, str(error))
 
-    async def _gaps_of_store(self, times: list[int | None]) -> web.StreamResponse:
+    async def _store_gaps(self, times: list[int | None]) -> web.StreamResponse:
         """The gaps of a robot whose spool is on another machine."""
         now_ns = time.time_ns()
         since_ns, until_ns = times[0] or now_ns - now_ns % DAY_NS, times[1] or now_ns
@@ -78,7 +78,7 @@ class PastRoutes:
     async def _past(self, request: web.Request) -> web.StreamResponse:
         do, robot = request.match_info['do'], request.query.get('robot', self._robot)
         if do == 'recent' and self._is_of_store:
-            return _nothing()  # its clock is not the robot's
+            return _nothing()  # its clock differs from the robot's
         takes = {'timeline': ('from', 'to'), 'range': ('from', 'to'), 'kept': ('from', 'to'), 'moment': ('at',)}.get(do, ())
         try:
             times = {name: query_ms(request, name) for name in takes}
@@ -88,7 +88,7 @@ class PastRoutes:
             return problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
         more = {name: request.query[name] for name in ('by', 'fit') if name in request.query}
         found = await self.ask(do, robot, {**times, **more})
-        return _nothing() if do == 'recent' and found.status != 200 else found  # then the live view starts empty
+        return _nothing() if do == 'recent' and found.status != 200 else found  # the live view then starts empty
 
 
 def _nothing() -> web.Response:

@@ -1,9 +1,11 @@
 """The cameras over RTSP, for players and recorders: JPEGs (RFC 2435), served by GStreamer in a separate process
 (``rtsp_process.py``).
 
-RFC 2435 supports baseline JPEGs in YUV 4:2:0 or 4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent, and
-the log reports them. A topic is read while somebody plays it. Debian and Ubuntu build GStreamer's bindings for the system's
-Python, so a process of that runs the script.
+RFC 2435 supports baseline JPEGs in YUV 4:2:0 or 4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent,
+which
+is logged. A topic is read while it is played. Debian and Ubuntu build GStreamer's bindings for the system's Python, so a process
+of
+that Python runs the script.
 """
 
 from __future__ import annotations
@@ -30,25 +32,25 @@ START_S: Final = 20.0
 AGAIN_S: Final = 5.0
 MAX_SIDE: Final = 2040
 PYTHON: Final = Path('/usr/bin/python3')
-"""Of the system."""
+"""The system's Python."""
 MAX_WAITING: Final = 4 << 20
-"""Bytes for a process that does not read; frames beyond it are skipped."""
+"""Bytes queued for a process that does not read; frames beyond it are skipped."""
 END_S: Final = 5.0
 _BASELINE, _FRAMES = 0xC0, range(0xC0, 0xD0)
 _NO_FRAMES: Final = (0xC4, 0xC8, 0xCC)
-"""Markers among those of frames that begin tables (ITU T.81, table B.1)."""
+"""Markers in the range of frames that start tables (ITU T.81, table B.1)."""
 
 
 class RtspUnavailable(DataLoggerError):
-    """This machine serves no RTSP."""
+    """This machine cannot serve RTSP."""
 
     DEFAULT_REMEDY = 'apt install python3-gi gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-base gstreamer1.0-plugins-good'
 
 
 class RtspServer:
-    """The process that serves, as long as this one. Used by one event loop. New; open once; close once.
+    """The process that serves RTSP. Used by one event loop. New; open once; close once.
 
-    ``changed`` is called when other topics are played than before.
+    ``changed`` is called when the set of played topics changes.
     """
 
     def __init__(self, address: str, port: int, password: str, changed: Callable[[], None]) -> None:
@@ -59,13 +61,13 @@ class RtspServer:
         self._cameras: list[str] = []
         self._refused: dict[str, str] = {}
         self.topics: frozenset[str] = frozenset()
-        """Those that somebody plays."""
+        """Topics that are played."""
         self.players: tuple[str, ...] = ()
-        """The addresses from which they are played."""
+        """Addresses that play them."""
         self.port = 0
 
     async def open(self) -> None:
-        """Raises RtspUnavailable where GStreamer is missing, or nobody can listen there."""
+        """Raises RtspUnavailable if GStreamer is missing, or the address cannot be listened on."""
         await self._start()
         self._task = asyncio.create_task(self._run())
 
@@ -77,10 +79,10 @@ class RtspServer:
         await self._process.end()
 
     def serve(self, cameras: Iterable[str]) -> None:
-        """Let these topics be played."""
+        """Offer these topics."""
         if (wanted := sorted(cameras)) != self._cameras:
             self._cameras = wanted
-            self._tell_topics()
+            self._send_topics()
 
     def offer(self, item: LiveItem) -> None:
         """A JPEG of one of the topics."""
@@ -94,7 +96,7 @@ class RtspServer:
         height, width, *_ = simplejpeg.decode_jpeg_header(item.body)
         self._process.tell({'topic': item.topic, 'width': width, 'height': height}, item.body)
 
-    def _tell_topics(self) -> None:
+    def _send_topics(self) -> None:
         self._process.tell({'topics': self._cameras})
 
     async def _start(self) -> None:
@@ -103,29 +105,31 @@ class RtspServer:
         except OSError as error:
             raise RtspUnavailable(f'{PYTHON} cannot be run: {error}') from error
         try:
-            said = await asyncio.wait_for(self._said(), START_S)
+            report = await asyncio.wait_for(self._read_report(), START_S)
         except asyncio.TimeoutError:
-            said = {'error': f'it says nothing for {START_S:.0f} s'}
-        if 'port' not in said:
+            report = {'error': f'no output for {START_S:.0f} s'}
+        if 'port' not in report:
             await self._process.end()
-            raise RtspUnavailable(f'RTSP is not served: {said.get("error", "the process ended")}', remedy=said.get('remedy', ''))
-        self.port = self._given['port'] = said['port']
-        self._tell_topics()
+            raise RtspUnavailable(
+                f'RTSP is not served: {report.get("error", "the process ended")}', remedy=report.get('remedy', '')
+            )
+        self.port = self._given['port'] = report['port']
+        self._send_topics()
 
-    async def _said(self) -> dict[str, Any]:
-        """The next line of the process; empty when it has ended."""
+    async def _read_report(self) -> dict[str, Any]:
+        """The next line of the process; empty when it has exited."""
         line = await self._process.output.readline()
         return dict(json.loads(line)) if line else {}
 
     async def _run(self) -> None:
-        """What is played; and the process again after it ended."""
+        """Read its reports; restart the process when it has exited."""
         while True:
-            while said := await self._said():
-                self.players = tuple(said.get('players', self.players))
-                self._watch(said.get('watched', self.topics))
+            while report := await self._read_report():
+                self.players = tuple(report.get('players', self.players))
+                self._watch(report.get('watched', self.topics))
             self.players = ()
             self._watch(())
-            log.warning('the process that serves RTSP has ended; it is started again')
+            log.warning('the process that serves RTSP has exited; it is restarted')
             while True:
                 await asyncio.sleep(AGAIN_S)
                 try:
@@ -141,9 +145,9 @@ class RtspServer:
 
 
 class _Process:
-    """The process of a script, which ends with its input. Used by one event loop. Start it again only after ``end``; end it.
+    """A child process running a script; it exits at the end of its input. Used by one event loop. Restart it only after ``end``.
 
-    It is fed with records: two uint32 (little-endian) with the lengths of a head in JSON and of a body, and these.
+    Its input is records: two uint32 (little-endian) with the lengths of a head in JSON and of a body, and these.
     """
 
     def __init__(self, script: Path) -> None:
@@ -159,18 +163,18 @@ class _Process:
 
     @property
     def pid(self) -> int | None:
-        """Of the process, while there is one."""
+        """The pid of the process, while there is one."""
         return None if self._process is None else self._process.pid
 
     async def start(self, first: Mapping[str, Any]) -> None:
-        """``first`` is its first record: everybody can read a command line. Raises OSError."""
+        """``first`` is its first record, because command lines are public. Raises OSError."""
         self._process = await asyncio.create_subprocess_exec(
             str(PYTHON),
             '-I',
             str(self._script),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for who feeds it
+            start_new_session=True,  # Ctrl-C is for the parent
         )
         self.tell(first)
 
@@ -182,7 +186,7 @@ class _Process:
             stdin.write(struct.pack('<II', len(text), len(body)) + text + body)
 
     async def end(self) -> None:
-        """Also where an earlier one was cancelled."""
+        """Also if an earlier call was cancelled."""
         if (process := self._process) is None:
             return
         if process.stdin is not None:
@@ -198,7 +202,7 @@ class _Process:
 
 
 async def _over(process: asyncio.subprocess.Process) -> None:
-    """Wait until it has ended. What it still prints is discarded: the end of one whose pipe is full is not seen."""
+    """Wait until it has exited. Its output is discarded: a process whose pipe is full would not exit."""
     assert process.stdout is not None
     while await process.stdout.read(1 << 16):
         pass
@@ -206,20 +210,20 @@ async def _over(process: asyncio.subprocess.Process) -> None:
 
 
 def unsuited(jpeg: bytes) -> str:
-    """Why RFC 2435 has no way to send this JPEG; empty where it has."""
+    """Why RFC 2435 cannot send this JPEG; empty if it can."""
     try:
         height, width, _, sampling = simplejpeg.decode_jpeg_header(jpeg)
     except ValueError as error:
-        return f'it is no JPEG: {error}'
+        return f'it is not a JPEG: {error}'
     if width % 8 or height % 8 or max(width, height) > MAX_SIDE:
-        return f'{width} x {height} pixels; RFC 2435 has multiples of 8 up to {MAX_SIDE}'
+        return f'{width} x {height} pixels; RFC 2435 supports multiples of 8 up to {MAX_SIDE}'
     if sampling not in ('420', '422'):
-        return f'its colors are sampled as {sampling}; RFC 2435 has 420 and 422'
-    return '' if _coding(jpeg) == _BASELINE else 'it is no baseline JPEG'
+        return f'its colors are sampled as {sampling}; RFC 2435 supports 420 and 422'
+    return '' if _coding(jpeg) == _BASELINE else 'it is not a baseline JPEG'
 
 
 def _coding(jpeg: bytes) -> int:
-    """The marker of the frame, which tells how it is coded; 0 where there is none."""
+    """The marker of the frame, which identifies its coding; 0 if there is none."""
     at = 2
     while at + 4 <= len(jpeg) and jpeg[at] == 0xFF:
         marker = jpeg[at + 1]

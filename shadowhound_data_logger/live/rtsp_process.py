@@ -1,9 +1,11 @@
 """Serves JPEGs from standard input over RTSP: a script for the system's Python, which has GStreamer's bindings (python3-gi).
 
-It imports nothing of this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON and
-of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``. Later ones name ``topics`` that are
-served, or a ``topic`` with ``width`` and ``height`` of the JPEG in the body. It prints lines of JSON: ``port``, ``watched``
-(topics that clients play), ``players`` (the addresses of these clients), or ``error``. It ends with its input.
+It imports nothing from this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON
+and
+of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``. Later ones have the served ``topics``,
+or
+a ``topic`` with ``width`` and ``height`` of the JPEG in the body. It prints lines of JSON: ``port``, ``watched`` (topics that
+clients play), ``players`` (the addresses of these clients), or ``error``. It exits at the end of its input.
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ ROLE = 'viewer'
 writing = threading.Lock()
 
 
-def say(**what: Any) -> None:
-    """A line for the process that feeds this one."""
+def report(**what: Any) -> None:
+    """Print a line for the parent process."""
     with writing:
         sys.stdout.write(json.dumps(what) + '\n')
         sys.stdout.flush()
@@ -43,7 +45,7 @@ def read(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
 
 
 class Cameras:
-    """The server and its pipelines: one a topic, shared by all who play it. The lock guards the sources."""
+    """The server and its pipelines: one per topic, shared by all clients. The lock guards the sources."""
 
     def __init__(self, rtsp: Any, gst: Any, digest: Any, given: dict[str, Any]) -> None:
         self._rtsp, self._gst = rtsp, gst
@@ -64,7 +66,7 @@ class Cameras:
         self.server.connect('client-connected', self._meet)
 
     def mount(self, topics: list[str]) -> None:
-        """Serve these; others that were served before stay."""
+        """Serve these topics; earlier ones stay."""
         for topic in topics:
             if topic not in self._mounted:
                 self._mounted.add(topic)
@@ -106,12 +108,12 @@ class Cameras:
         self._follow(client, '')
 
     def _follow(self, client: Any, address: str) -> None:
-        """Say from where clients play; without an address it plays no more."""
+        """Report the addresses of clients that play; empty: it stopped."""
         with self._lock:
             self._players.pop(client, None)
             if address:
                 self._players[client] = address
-            say(players=sorted({*self._players.values()}))
+            report(players=sorted({*self._players.values()}))
 
     def _begin(self, _: Any, media: Any, topic: str) -> None:
         frames = media.get_element().get_by_name('frames')
@@ -119,21 +121,21 @@ class Cameras:
             self._sources[topic] = frames
             self._caps.pop(topic, None)
             media.connect('unprepared', self._end, topic, frames)
-            self._tell()
+            self._report()
 
     def _end(self, _: Any, topic: str, frames: Any) -> None:
         with self._lock:
-            if self._sources.get(topic) is frames:  # and not that of one that has taken its place
+            if self._sources.get(topic) is frames:  # and not the source that has replaced it
                 del self._sources[topic]
-            self._tell()
+            self._report()
 
-    def _tell(self) -> None:
-        say(watched=sorted(self._sources))
+    def _report(self) -> None:
+        report(watched=sorted(self._sources))
 
 
 def main() -> None:
     """Until the input ends."""
-    sys.stdout = os.fdopen(os.dup(1), 'w')  # ours alone: what drivers print, as NVIDIA's do, goes where errors go
+    sys.stdout = os.fdopen(os.dup(1), 'w')  # stdout is for our protocol; prints of drivers go to stderr
     os.dup2(2, 1)
     first = read(sys.stdin.buffer)
     if first is None:
@@ -145,16 +147,16 @@ def main() -> None:
             gi.require_version(name, '1.0')
         from gi.repository import GLib, Gst, GstRtsp, GstRtspServer  # noqa: PLC0415
     except (ImportError, ValueError) as error:
-        say(error=f'the system has no RTSP server: {error}')
+        report(error=f'the system has no RTSP server: {error}')
         return
     Gst.init(None)
     lacks = [name for name in ('appsrc', 'rtpjpegpay') if Gst.ElementFactory.find(name) is None]
     if lacks:
-        say(error=f'GStreamer has no {" and no ".join(lacks)}')
+        report(error=f'GStreamer has no {" and no ".join(lacks)}')
         return
     cameras = Cameras(GstRtspServer, Gst, GstRtsp.RTSPAuthMethod.DIGEST, first[0])
     if not cameras.server.attach(None):
-        say(error=f'nobody can listen at {first[0]["address"]} port {first[0]["port"]}', remedy='name a free port: --rtsp PORT')
+        report(error=f'cannot listen at {first[0]["address"]} port {first[0]["port"]}', remedy='name a free port: --rtsp PORT')
         return
     loop = GLib.MainLoop()
 
@@ -168,12 +170,12 @@ def main() -> None:
         GLib.idle_add(loop.quit)
 
     def forget() -> bool:
-        """Sessions of players that went without a word; until this returns False."""
+        """Remove sessions of players that disappeared; until this returns False."""
         cameras.server.get_session_pool().cleanup()
         return True
 
     GLib.timeout_add_seconds(CLEAN_S, forget)
-    say(port=cameras.server.get_bound_port())
+    report(port=cameras.server.get_bound_port())
     threading.Thread(target=follow, daemon=True).start()
     loop.run()
 

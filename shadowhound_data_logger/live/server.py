@@ -1,6 +1,6 @@
-"""The server of the live page, assembled: HTTP and its connections, the files of the page, and what happens once per second.
+"""The server of the live page: HTTP and its connections, the files of the page, and the work done once per second.
 
-``auth.py`` decides who may do what, ``viewers.py`` what each viewer is sent, ``past_routes.py`` answers about the past,
+``auth.py`` controls access, ``viewers.py`` decides what each viewer is sent, ``past_routes.py`` answers about the past,
 ``acts.py`` does what operators request, ``cameras.py`` sends video.
 """
 
@@ -50,14 +50,14 @@ log = logging.getLogger(__name__)
 
 PAGE: Final = Path(__file__).parent / 'page'
 MAX_CONNECTIONS: Final = 200
-"""Of viewers and everybody else."""
+"""Of viewers and all other clients."""
 IDLE_S: Final = 15.0
 """Between requests."""
 FIGURES_S: Final = 1.0
 LEDGER_EVERY: Final = 2
 """The ledger is read with every second status."""
 CHECK_S: Final = 5.0
-"""How often it is checked whether those who watch are still signed in."""
+"""Interval of checking whether viewers are still signed in."""
 LEASE_EVERY_S: Final = 2.0
 
 
@@ -78,9 +78,9 @@ class LiveSettings:
     is_of_store: bool = False
     """Whether the page is that of a store, with the past of all its robots, and not a robot's own."""
     robot_url: str = ''
-    """Of a store's page: where the robot's own page is, from which the live view is relayed; empty: there is none."""
+    """For a store's page: the URL of the robot's own page, whose live view is relayed; empty: none."""
     robot_token: Path | None = None
-    """The file with the token of a viewer there."""
+    """The file with a viewer's token for that page."""
     rtsp: int | None = None
     """The port of RTSP; None: it is not served."""
     tiles: str = ''
@@ -88,7 +88,7 @@ class LiveSettings:
     waits: str = ''
     """What the page is waiting for, in words; empty: nothing."""
     uploads_mbps: float = 4.0
-    """What uploads are limited to while somebody watches over the network; 0: they are not limited."""
+    """Upload limit while remote viewers watch; 0: none."""
     alerts: AlertSettings | None = None
     """Where alerts are sent; None: nowhere."""
 
@@ -128,7 +128,7 @@ class LiveServer:
         self.port = settings.port
 
     async def open(self) -> None:
-        """Raises OSError if nobody can listen there, or the certificate cannot be read; RtspUnavailable."""
+        """Raises OSError if the address cannot be listened on, or the certificate cannot be read; RtspUnavailable."""
         self._loop = asyncio.get_running_loop()
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
         app.add_routes([
@@ -136,7 +136,7 @@ class LiveServer:
             *self.cuts.routes(),
             web.get('/{name:.*}', self._file),
         ])  # fmt: skip
-        logging.getLogger('aiohttp.server').addFilter(_is_ours)
+        logging.getLogger('aiohttp.server').addFilter(_is_worth_logging)
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S, lingering_time=1.0)
         await self._runner.setup()
         secure = None
@@ -152,13 +152,13 @@ class LiveServer:
         self._open_topics()
         self._tickers = [asyncio.create_task(each) for each in (self._tick(), self._end_unknown())]
         for ticker in self._tickers:
-            ticker.add_done_callback(_tell_failure)
+            ticker.add_done_callback(_log_failure)
         if self._alerts is not None:
             self._alerts.open()
         if self._settings.rtsp is not None:
             await self.cameras.open_rtsp(self._settings.bind, self._settings.rtsp, rtsp_password(self._settings.tokens))
             self.cameras.serve(self.viewers.camera_topics)
-            self.viewers.rewatch()  # the topics of the graph are needed even while nobody watches
+            self.viewers.rewatch()  # the topics of the graph are needed even without viewers
 
     async def close(self) -> None:
         for ticker in self._tickers:
@@ -182,7 +182,7 @@ class LiveServer:
 
     @property
     def rtsp_url(self) -> str:
-        """To which the name of a camera's topic is appended; empty if RTSP is not served."""
+        """The prefix of the cameras' RTSP URLs; empty if RTSP is not served."""
         return '' if self.cameras.rtsp is None else f'rtsp://{self._host}:{self.cameras.rtsp.port}'
 
     @property
@@ -207,7 +207,7 @@ class LiveServer:
     # -- topics ----------------------------------------------------------------------------------------------------
 
     def _open_topics(self) -> None:
-        """Read topics if ROS is here; otherwise only the data is shown."""
+        """Read topics if ROS is available; otherwise only the data is shown."""
         if self._settings.is_of_store:
             if self._settings.robot_url:
                 self._relay = Relay(self._settings.robot_url, self._settings.robot_token, lambda: self.viewers.wanted,
@@ -237,7 +237,7 @@ class LiveServer:
     # -- once per second -------------------------------------------------------------------------------------------
 
     async def _tick(self) -> None:
-        """The figures, the sizes, the lease, and threads that died."""
+        """The status values, the sizes, the lease, and threads that ended."""
         rounds = 0
         lease_s = 0.0
         while True:
@@ -247,8 +247,8 @@ class LiveServer:
                 self._topics.worker.poll()
             if self.viewers.connected and not self._settings.is_of_store:
                 try:
-                    await self._tell_figures(with_ledger=rounds % LEDGER_EVERY == 0)
-                except Exception:  # the one supervised catch-all: the page shows the age of what it has
+                    await self._send_figures(with_ledger=rounds % LEDGER_EVERY == 0)
+                except Exception:  # the one supervised catch-all: the page shows the age of its values
                     log.exception('the figures cannot be read')
             self.viewers.tick(began_s)
             if self._settings.uploads_mbps and began_s >= lease_s and self.viewers.is_watched_remotely:
@@ -257,13 +257,13 @@ class LiveServer:
             rounds += 1
             await asyncio.sleep(max(0.05, began_s + FIGURES_S - time.monotonic()))
 
-    async def _tell_figures(self, *, with_ledger: bool) -> None:
+    async def _send_figures(self, *, with_ledger: bool) -> None:
         async with self._reading:
             item = await self._loop.run_in_executor(self._pool, partial(self._read_figures, with_ledger=with_ledger))
         self.viewers.tell_all(item)
 
     def _read_figures(self, *, with_ledger: bool) -> LiveItem:
-        """``at`` is when their ages were correct: the ledger may take a while."""
+        """``at`` is when their ages were correct: reading the ledger may take a while."""
         at_ms = round(time.monotonic() * 1e3, 1)
         return LiveItem('', 'figures', head={'at': at_ms, 'figures': self._figures.now(with_ledger=with_ledger)})
 
@@ -291,7 +291,7 @@ class LiveServer:
     # -- connections and files -------------------------------------------------------------------------------------
 
     def _connected(self) -> asyncio.BaseProtocol:
-        """The handler of a new connection: with too many, the one that has been idle for longest is dropped."""
+        """The handler of a new connection: with too many, the one that has been idle longest is closed."""
         assert self._runner is not None
         assert self._runner.server is not None
         here = self._runner.server.connections
@@ -305,14 +305,14 @@ class LiveServer:
         return handler
 
     def _drop_silent(self) -> None:
-        """Connections whose first request does not arrive, and viewers that send nothing any more."""
+        """Close connections without a first request, and viewers that stopped sending."""
         before_s = time.monotonic() - REQUEST_S
         for each in [each for each, since_s in self._silent.items() if since_s < before_s]:
             self._drop(each)
         self.viewers.end_silent()
 
     async def _end_unknown(self) -> None:
-        """A connection ends with the sign-in that it came by and with the token that signed it, whatever else hangs."""
+        """End the connections whose sign-in or token is no longer valid, even if other tasks hang."""
         while True:
             await asyncio.sleep(CHECK_S)
             self.viewers.end(lambda one: self.auth.access.who(one.cookie) != one.who)
@@ -340,19 +340,19 @@ class LiveServer:
         return web.Response(body=body, headers={**headers, 'Content-Type': kind})
 
 
-def _tell_failure(ticker: asyncio.Task[None]) -> None:
-    """Nobody awaits a task that runs until the page ends: if it fails, the log reports it immediately."""
+def _log_failure(ticker: asyncio.Task[None]) -> None:
+    """Log the failure of a task that runs until the page ends, and that is never awaited."""
     if not ticker.cancelled() and (error := ticker.exception()) is not None:
         log.error('a task of the page has failed: start the page again', exc_info=error)
 
 
-def _is_ours(record: logging.LogRecord) -> bool:
-    """Whether it is more than a client that sent no valid HTTP, which could fill the log."""
+def _is_worth_logging(record: logging.LogRecord) -> bool:
+    """Whether it is more than invalid HTTP from a client, which could fill the log."""
     return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
 
 
 def _static(folder: Path) -> list[tuple[str, tuple[bytes, bytes, str, str]]]:
-    """All files of the page, plain and compressed: names are looked up among these, so no path leads elsewhere."""
+    """All files of the page, plain and compressed: requests are looked up among these, so no path leads elsewhere."""
     found = []
     for path in sorted(path for path in folder.rglob('*') if path.is_file() and path.suffix != '.json'):
         body = path.read_bytes()

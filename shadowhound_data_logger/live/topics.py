@@ -1,9 +1,8 @@
-"""The topics that somebody watches, read raw and polled. Importing this loads rclpy.
+"""The watched topics, read raw and polled. Importing this loads rclpy.
 
-A subscription exists as long as somebody watches its topic: as it is drawn (``/imu``), as a tree (``/imu#``), or a number of it
-(``/imu#orientation.w``). All are BEST_EFFORT and shallow, whatever the publisher offers: nobody waits for the live page, and
-nothing is sent again for it. Only what publishers keep for all who come later (maps, static transforms) is requested as they
-offer it.
+A subscription exists as long as its topic is watched: as a drawing (``/imu``), as a tree (``/imu#``), or as a number
+(``/imu#orientation.w``). All are BEST_EFFORT and shallow, whatever the publisher offers: no publisher waits for the live page or
+resends for it. Only latched topics (maps, static transforms) are subscribed to as offered.
 """
 
 from __future__ import annotations
@@ -42,24 +41,24 @@ NODE: Final = 'shadowhound_live'
 POLL_S: Final = 1 / 30
 GRAPH_S: Final = 1.0
 BULK_DEPTH, ROWS_DEPTH = 2, 128
-"""Of bulk, and of a topic of which all messages are shown; of others only the newest is kept."""
+"""Depth for bulk topics, and for topics whose messages are all shown; for others only the newest is kept."""
 MAX_GATHERED: Final = 500
 MAX_TOPICS: Final = 2000
-"""Of the graph that are told, those with a publisher first."""
+"""Maximum topics of the graph that are sent, those with a publisher first."""
 MAX_PUBLISHERS: Final = 100
 COUNTS: Final = 60
-"""Topics whose publishers are counted per look; those that are new in any case."""
+"""Topics whose publishers are counted per check; new ones are always counted."""
 RATE_S: Final = 4.0
 TREE, FIELD = Kind('message', 2.0, is_bulk=True), Kind('field', 20.0, is_bulk=False)
 _Wanted = Mapping[str, frozenset[int]]
-"""What is watched (a topic, with ``#`` as a tree, with ``#path`` a number of it) -> the sizes in which it is."""
+"""Watched keys (a topic, with ``#`` as a tree, with ``#path`` one of its numbers) -> the sizes."""
 
 
 class _View:
-    """One way in which a topic is watched."""
+    """One way of watching a topic."""
 
     def __init__(self, topic: str, type_name: str, key: str) -> None:
-        """Raises Rejected for a key that is none."""
+        """Raises Rejected for an invalid key."""
         self.path: str | None = None
         self.maker: Maker | None = None
         self.is_latched = self._is_gathered = False
@@ -73,30 +72,30 @@ class _View:
             self.is_latched, self._is_gathered = panel.is_latched, panel.is_gathered
         else:
             self.kind = KINDS[type_name]
-        self._is_each_shown = not self.kind.is_bulk and 1 / self.kind.most_hz < POLL_S
+        self._is_each_shown = not self.kind.is_bulk and 1 / self.kind.max_hz < POLL_S
         self.depth = ROWS_DEPTH if self._is_gathered or self._is_each_shown else BULK_DEPTH if self.kind.is_bulk else 1
         self._next_s = 0.0
         self._waiting: list[Taken] = []
 
     def is_due(self, now_s: float) -> bool:
-        """Whether to look: what would not be shown is left to the middleware, which keeps the newest."""
+        """Whether to drain: messages that would not be shown are left to the middleware, which keeps the newest."""
         return self._is_each_shown or now_s >= self._next_s
 
     def shown(self, taken: list[Taken], now_s: float) -> list[Taken]:
-        """Those messages that are shown now, of these and of those before."""
+        """The messages to show now, from these and earlier ones."""
         if self._is_each_shown:
-            return taken[-round(2 * POLL_S * self.kind.most_hz) :]
+            return taken[-round(2 * POLL_S * self.kind.max_hz) :]
         if taken:
             self._waiting = [*self._waiting, *taken][-MAX_GATHERED:] if self._is_gathered else taken[-1:]
         if not self._waiting or now_s < self._next_s:
             return []
-        self._next_s = max(self._next_s + 1 / self.kind.most_hz, now_s - POLL_S)
+        self._next_s = max(self._next_s + 1 / self.kind.max_hz, now_s - POLL_S)
         waiting, self._waiting = self._waiting, []
         return waiting
 
 
 class _Watched:
-    """One topic that is watched, in one or several views."""
+    """A watched topic with its views."""
 
     def __init__(self, node: Node, topic: str, type_name: str, keys: Collection[str]) -> None:
         """Raises TypeUnavailable, SubscriptionRefused or Rejected."""
@@ -117,7 +116,7 @@ class _Watched:
         return any(view.is_due(now_s) for view in self.views.values())
 
     def count(self, taken: list[Taken], now_s: float) -> None:
-        """Messages by their numbers, where there are any: those that were left to the middleware count too."""
+        """Count messages by sequence number if there are any: those left in the middleware count too."""
         for one in taken:
             last = self._numbers.get(one.publisher)
             self._count += 1 if last is None or one.number is None else max(1, min(one.number - last, 10_000))
@@ -130,7 +129,7 @@ class _Watched:
 
     @property
     def rate_hz(self) -> float | None:
-        """Messages per second of the last seconds; None before the second one."""
+        """Message rate of the last seconds; None before the second message."""
         if len(self._counts) < 2:
             return None
         (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
@@ -138,15 +137,15 @@ class _Watched:
 
 
 class Topics:
-    """Reads what is watched, on the thread ``topics``, which alone makes and ends subscriptions.
+    """Reads the watched topics on the thread ``topics``, which alone creates and closes subscriptions.
 
-    New; open once; close once. ``wanted`` says what is watched, None while there is no viewer; ``found`` is told topics and
-    types of the graph with their number, ``came`` what there is to show. All three are called by the thread.
+    New; open once; close once. ``wanted`` returns what is watched, None without viewers; ``on_graph`` is called with the topics
+    and types of the graph and their number, ``on_items`` with new items. All three are called on the thread.
     """
 
-    def __init__(self, wanted: Callable[[], _Wanted | None], found: Callable[[Graph, int], None],
-                 came: Callable[[list[LiveItem]], None]) -> None:  # fmt: skip
-        self._wanted, self._found, self._came = wanted, found, came
+    def __init__(self, wanted: Callable[[], _Wanted | None], on_graph: Callable[[Graph, int], None],
+                 on_items: Callable[[list[LiveItem]], None]) -> None:  # fmt: skip
+        self._wanted, self._on_graph, self._on_items = wanted, on_graph, on_items
         self._types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         self._node: Node | None = None
         self._guard: PortGuard | None = None
@@ -155,7 +154,7 @@ class Topics:
         self._publishers: dict[str, int] = {}
         self._graph_s = self._next_s = 0.0
         self._watched: dict[str, _Watched] = {}
-        self._followed: _Wanted | None = None  # the server replaces it when somebody chooses
+        self._followed: _Wanted | None = None  # the server replaces it when a viewer chooses
         self._refused: dict[str, tuple[str, set[str]]] = {}
         self._problems: dict[str, str] = {}
         self._wake = threading.Event()
@@ -171,14 +170,14 @@ class Topics:
         self.worker.start()
 
     def wake(self) -> None:
-        """What is wanted has changed."""
+        """The wanted topics have changed."""
         self._wake.set()
 
     def close(self) -> None:
         self.worker.stop()
         self._wake.set()
         if not self.worker.join(5.0):
-            log.warning('the thread that reads topics does not end')
+            log.warning('the thread that reads topics does not stop')
         for one in self._watched.values():
             one.reader.close()
         if self._node is not None:
@@ -191,7 +190,7 @@ class Topics:
 
     def _step(self) -> None:
         wanted = self._wanted()
-        if wanted:  # a sleep costs less than a wait, and ends soon enough
+        if wanted:  # a sleep is cheaper than a wait, and ends soon enough
             time.sleep(max(0.0, self._next_s - time.monotonic()))
         else:
             self._wake.wait(GRAPH_S)
@@ -205,14 +204,14 @@ class Topics:
             return
         if now_s - self._graph_s >= GRAPH_S:
             self._graph_s = now_s
-            self._look()
+            self._check_graph()
             self._followed = None
         if wanted is not self._followed:
             self._follow(wanted)
             self._followed = wanted
         self._drain(wanted, now_s)
 
-    def _look(self) -> None:
+    def _check_graph(self) -> None:
         assert self._node is not None
         seen = {topic: types for topic, types in self._node.get_topic_names_and_types() if types}
         counted = [topic for topic in seen if topic not in self._publishers]
@@ -220,7 +219,7 @@ class Topics:
         first = self._counted % max(1, len(known))
         self._counted = first + COUNTS
         counted += [*known[first:], *known[:first]][:COUNTS]
-        own = {'/parameter_events': 1}  # each node of rclpy publishes it
+        own = {'/parameter_events': 1}  # every rclpy node publishes it
         counts = {topic: self._node.count_publishers(topic) - own.get(topic, 0) for topic in counted}
         self._publishers = {topic: counts.get(topic, self._publishers.get(topic, 0)) for topic in seen}
         rows = [
@@ -235,7 +234,7 @@ class Topics:
         graph = {topic: (type_name, count) for topic, type_name, count in rows[:MAX_TOPICS]}
         if graph != self._graph or len(rows) != self._total:
             self._graph, self._total = graph, len(rows)
-            self._found(graph, len(rows))
+            self._on_graph(graph, len(rows))
 
     def _follow(self, wanted: _Wanted) -> None:
         assert self._node is not None
@@ -258,18 +257,18 @@ class Topics:
                 except (TypeUnavailable, SubscriptionRefused, Rejected) as error:
                     self._refused[topic] = type_name, keys
                     log.warning('%s is not shown: %s', topic, error)
-                    self._came([item for key in sorted(keys) for item in self._problem(key, str(error))])
+                    self._on_items([item for key in sorted(keys) for item in self._problem(key, str(error))])
 
     def _drain(self, wanted: _Wanted, now_s: float) -> None:
         items: list[LiveItem] = []
         for topic, one in self._watched.items():
             if not one.is_due(now_s):
                 continue
-            came = one.reader.drain(one.most)
+            received = one.reader.drain(one.most)
             for key, view in one.views.items():
                 if view.kind is TREE:
-                    one.count(came, now_s)
-                taken = view.shown(came, now_s)
+                    one.count(received, now_s)
+                taken = view.shown(received, now_s)
                 sizes = wanted.get(key, frozenset())
                 if not taken or not sizes:
                     continue
@@ -283,17 +282,17 @@ class Topics:
                         log.warning('%s: a message cannot be shown: %s', topic, error)
                     items += self._problem(key, str(error))
         if items:
-            self._came(items)
+            self._on_items(items)
 
     def _problem(self, key: str, why: str) -> list[LiveItem]:
-        """Why something that is watched is not shown, when that changes; empty: it is shown again."""
+        """Report why a watched topic is not shown, when that changes; empty: it is shown again."""
         if self._problems.get(key, '') == why:
             return []
         self._problems[key] = why
         return [LiveItem(key, 'problem', head={'at': round(time.monotonic() * 1e3, 1), 'text': visible(why)[:300]})]
 
     def _items(self, key: str, one: _Watched, view: _View, taken: list[Taken], sizes: list[int]) -> list[LiveItem]:
-        # By this machine's own clocks: when it came here, as what ``time.monotonic`` will be compared with.
+        # By this machine's own clock: arrival here, for comparison with ``time.monotonic``.
         offset_ns = time.monotonic_ns() - time.time_ns()
         messages = [((message.received_ns + offset_ns) / 1e6, message.cdr) for message in taken]
         at_ms, cdr = messages[-1]

@@ -1,4 +1,4 @@
-"""A message of any type as a tree for the page, and single numbers of it. Whatever is in the message, a tree is small.
+"""A message of any type as a tree for the page, and single numbers of it. A tree is small whatever the message contains.
 
 A node of a tree is a scalar of JSON, a message (``{"t": type, "f": {field: node}}``), or an array (``{"t": type, "n": length,
 "a": [first nodes]}``). Numbers that JavaScript cannot represent are text. A path names one number: ``pose.position.x`` or
@@ -25,11 +25,11 @@ MAX_SHOWN: Final = 32
 """Elements of an array."""
 MAX_TEXT: Final = 300
 MAX_CHARACTERS: Final = 40_000
-"""Of all text of a tree."""
+"""Of all text in a tree."""
 MAX_DEPTH: Final = 20
 MAX_PATH: Final = 200
 CUT: Final = '…'
-"""In place of what a tree omits."""
+"""Replaces what a tree omits."""
 _EXACT: Final = 1 << 53
 _PATH: Final = re.compile(r'[A-Za-z]\w*(?:\.[A-Za-z]\w*|\[\d{1,7}\])*', re.ASCII)
 _PART: Final = re.compile(r'(\w+)(\])?')
@@ -82,7 +82,7 @@ class _Builder:
 
 
 def _is_single(description: Any) -> bool:
-    """Whether a field has float32, of which seven digits are significant."""
+    """Whether a field is float32, which has seven significant digits."""
     kind, of = description
     return _is_single(of[0]) if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else kind == Nodetype.BASE and of[0] == 'float32'
 
@@ -101,7 +101,7 @@ def parsed(path: str) -> tuple[str | int, ...]:
 
 
 def number(message: Any, path: str) -> float:
-    """The number there; NaN where an array is shorter. Raises Rejected where the type has no number of that name."""
+    """The number at a path; NaN if an array is shorter. Raises Rejected if the type has no such number."""
     value = message
     for part in parsed(path):
         if isinstance(part, int):
@@ -121,5 +121,5 @@ def number(message: Any, path: str) -> float:
 
 
 def numbers(messages: Iterable[tuple[float, Any]], path: str) -> list[tuple[float, dict[str, float]]]:
-    """Rows of one figure, with the times of the messages."""
+    """Rows with one value, with the times of the messages."""
     return [(at_ms, {path: number(message, path)}) for at_ms, message in messages]

@@ -27,11 +27,11 @@ log = logging.getLogger(__name__)
 
 MAX_VIEWERS: Final = 16
 MAX_MESSAGE: Final = 16 << 10
-"""Bytes of a message of a viewer."""
+"""Maximum size of a viewer's message."""
 MAX_WATCHED: Final = 32
 """Topics that one viewer watches."""
 REWATCH_S: Final = 0.1
-"""Between two changes of what is read, when viewers choose."""
+"""Minimum interval between changes of what is read, when viewers choose."""
 NARROW_S: Final = 10.0
 """A viewer whose link did not carry full frames for this long is offered video."""
 SILENT_S: Final = 8.0
@@ -39,16 +39,16 @@ SILENT_S: Final = 8.0
 AF41: Final = 34 << 2
 """DSCP of interactive video (RFC 4594), in the byte where IP has it."""
 KEPT: Final = frozenset({*BULK, 'message', 'problem'})
-"""Kinds whose newest item is sent to a viewer that begins to watch: it may have been published once."""
+"""Kinds whose newest item is sent to a new viewer: it may have been published once."""
 Graph = Mapping[str, tuple[str, int]]
-"""Topic -> its type and number of publishers, as ROS has them."""
+"""Topic -> its type and number of publishers."""
 _MIN_RTT: Final = struct.Struct('=148xI')
-"""tcp_info.tcpi_min_rtt of linux/tcp.h, in microseconds."""
+"""Offset of tcp_info.tcpi_min_rtt in linux/tcp.h, in microseconds."""
 
 
 @dataclass(eq=False)
 class Connected:
-    """A viewer, and who it is."""
+    """A connected viewer and its sign-in."""
 
     ws: web.WebSocketResponse
     viewer: Viewer
@@ -56,31 +56,31 @@ class Connected:
     who: SignIn
     address: str
     at: str
-    """The address of ours that it reached."""
+    """Our address that it connected to."""
     protocol: asyncio.BaseProtocol
     tasks: list[asyncio.Task[None]] = field(default_factory=list)
-    heard_s: float = field(default_factory=time.monotonic)
+    received_s: float = field(default_factory=time.monotonic)
     """When it last sent something."""
     narrow_s: float | None = None
-    """Since when its link carries no full frames."""
+    """Since when its link does not carry full frames."""
     asks: asyncio.Task[None] | None = None
     """Its request for video."""
     transport: asyncio.BaseTransport | None = None
     """Its connection, once it is a WebSocket."""
     ready: asyncio.Event = field(default_factory=asyncio.Event)
-    """Something may be sent."""
+    """Something can be sent."""
 
     def tell(self, item: LiveItem) -> None:
-        """Send it, together with everything else that is offered in the same round of the event loop."""
+        """Send it, together with all other items of the same iteration of the event loop."""
         self.viewer.offer(item)
         self.ready.set()
 
 
 class Viewers:
-    """Everybody who watches the page. Lifecycle: New; ``serve`` each connection; ``end_all`` once. Used by one event loop."""
+    """All viewers of the page. Lifecycle: New; ``serve`` each connection; ``end_all`` once. Used by one event loop."""
 
     def __init__(self, auth: Auth, cameras: Cameras, wake: Callable[[], None], *, is_of_store: bool) -> None:
-        """``wake`` is called when other topics are to be read than before."""
+        """``wake`` is called when the set of topics to read changes."""
         self._auth, self._cameras, self._wake, self._is_of_store = auth, cameras, wake, is_of_store
         self.connected: set[Connected] = set()
         self.graph: Graph = {}
@@ -88,7 +88,7 @@ class Viewers:
         self._total = 0
         self._kept: dict[tuple[str, bool], LiveItem] = {}
         self.wanted: dict[str, frozenset[int]] | None = None
-        """Topic -> the sizes in which it is shown; None while nobody watches."""
+        """Topic -> the sizes in which it is shown; None without viewers."""
         self.ros_problem = ''
         """Why only the data is shown; empty if topics are read."""
         self._relayed_topics: LiveItem | None = None
@@ -105,7 +105,7 @@ class Viewers:
         own = request.transport.get_extra_info('sockname') if request.transport is not None else None
         one = Connected(ws, Viewer(), request.cookies.get(COOKIE), self._auth.who(request), request.remote or '',
                         own[0] if own else '', request.protocol)  # fmt: skip
-        self.connected.add(one)  # before anything waits: the maximum counts those that are being connected
+        self.connected.add(one)  # before any await: the maximum includes viewers that are connecting
         try:
             await ws.prepare(request)
             _prioritize(request.transport)
@@ -134,13 +134,13 @@ class Viewers:
             request.transport.abort()  # one that reads nothing would not read a close frame either
 
     def end(self, ends: Callable[[Connected], bool]) -> None:
-        """Disconnect those for whom it is true, without a close frame: one that reads nothing would delay it."""
+        """Disconnect matching viewers, without a close frame: one that reads nothing would delay it."""
         for task in [task for one in self.connected if ends(one) for task in one.tasks]:
             task.cancel()
 
     def end_silent(self) -> None:
         before_s = time.monotonic() - SILENT_S
-        self.end(lambda one: one.heard_s < before_s)
+        self.end(lambda one: one.received_s < before_s)
 
     @property
     def is_watched_remotely(self) -> bool:
@@ -156,7 +156,7 @@ class Viewers:
             one.tell(item)
 
     def on_graph(self, graph: Graph, total: int = 0) -> None:
-        """The topics have changed; ``total`` counts those too that are more than can be told."""
+        """The topics have changed; ``total`` also counts those beyond the limit."""
         self.graph, self._total = graph, max(total, len(graph))
         self._cameras.serve(self.camera_topics)
         for one in self.connected:
@@ -164,7 +164,7 @@ class Viewers:
         self.rewatch()
 
     def on_items(self, items: Iterable[LiveItem]) -> None:
-        """Messages of topics that are wanted."""
+        """Messages of watched topics."""
         for item in items:
             self._keep(item)
             for one in self.connected:
@@ -173,7 +173,7 @@ class Viewers:
             self._cameras.offer(item)
 
     def on_relayed(self, item: LiveItem) -> None:
-        """An item of the robot's own page."""
+        """An item from the robot's own page."""
         if item.kind == 'topics':
             self._relayed_topics = item
         self._keep(item)
@@ -187,7 +187,7 @@ class Viewers:
         return [topic for topic in self.graph if self._kind_of(topic) == 'camera']
 
     def tick(self, now_s: float) -> None:
-        """Once per second: the sizes in which each viewer gets what it watches."""
+        """Once per second: update the sizes for each viewer."""
         self._cameras.tick()
         for one in self.connected:
             one.viewer.has_video = self._cameras.has(one)
@@ -199,7 +199,7 @@ class Viewers:
             self.rewatch()
 
     def suggest_video(self, one: Connected, now_s: float) -> None:
-        """Offer video to a viewer whose link was narrow for a while."""
+        """Offer video to a viewer whose link was slow for a while."""
         sizes = [one.viewer.size(topic) for topic in one.viewer.watched if self._kind_of(topic) == 'camera']
         if self._cameras.no_video or all(size == FULL for size in sizes):
             one.narrow_s = None
@@ -217,7 +217,7 @@ class Viewers:
         one.tell(LiveItem('', 'topics', head={'topics': topics, 'total': self._total, 'problem': self.ros_problem}))
 
     def _kind_of(self, topic: str) -> str:
-        """How it is drawn; empty if it is not."""
+        """How the topic is drawn; empty if it is not."""
         kind = kind_of(topic, self.graph.get(topic, ('', 0))[0])
         return '' if kind is None else kind.name
 
@@ -228,13 +228,13 @@ class Viewers:
     # -- what is read for them -------------------------------------------------------------------------------------
 
     def _rewatch_soon(self) -> None:
-        """A viewer that keeps choosing creates no more subscriptions than others."""
+        """Delayed, so that a viewer that keeps choosing creates no more subscriptions than others."""
         if self._rewatching is None:
             wait_s = max(0.0, self._rewatched_s + REWATCH_S - time.monotonic())
             self._rewatching = asyncio.get_running_loop().call_later(wait_s, self.rewatch)
 
     def rewatch(self) -> None:
-        """After a viewer came, left or chose."""
+        """After a viewer connected, disconnected or chose."""
         if self._rewatching is not None:
             self._rewatching.cancel()
             self._rewatching = None
@@ -257,7 +257,7 @@ class Viewers:
     async def _receive(self, one: Connected) -> None:
         while True:
             message = await one.ws.receive()
-            one.heard_s = time.monotonic()
+            one.received_s = time.monotonic()
             if message.type == WSMsgType.BINARY and len(message.data) == 4:
                 one.viewer.acknowledge(int.from_bytes(message.data, 'little'))
                 one.ready.set()
@@ -266,8 +266,8 @@ class Viewers:
             elif message.type in (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR):
                 return
 
-    def _take(self, one: Connected, said: Mapping[str, Any]) -> None:
-        ping, watched = said.get('ping'), said.get('watch')
+    def _take(self, one: Connected, request: Mapping[str, Any]) -> None:
+        ping, watched = request.get('ping'), request.get('watch')
         if isinstance(ping, (int, float)):
             one.tell(LiveItem('', 'pong', head={'ping': ping, 'now': round(time.monotonic() * 1e3, 2)}))
         if isinstance(watched, list):
@@ -277,11 +277,11 @@ class Viewers:
                 if topic in one.viewer.watched and topic not in before:
                     one.tell(item)
             self._rewatch_soon()
-        if 'video' in said:
-            self._take_video(one, said['video'])
+        if 'video' in request:
+            self._take_video(one, request['video'])
 
     def _take_video(self, one: Connected, request: Any) -> None:
-        """A viewer takes a topic as video, or none any longer."""
+        """A viewer takes a topic as video, or stops."""
         if one.asks is not None:
             one.asks.cancel()
             one.asks = None
@@ -295,7 +295,7 @@ class Viewers:
 
 
 async def _send(one: Connected) -> None:
-    """Send what the viewer may be sent, until its connection ends."""
+    """Send the viewer's frames until its connection ends."""
     while True:
         await one.ready.wait()
         one.ready.clear()
@@ -314,9 +314,9 @@ def _round_s(transport: asyncio.BaseTransport | None) -> float:
 
 
 def _prioritize(transport: asyncio.BaseTransport | None) -> None:
-    """Send frames immediately, marked as interactive video where the system allows it, and keep few waiting in the kernel.
+    """Send frames immediately, marked as interactive video where the system allows it, and keep few queued in the kernel.
 
-    What waits there is stale when it arrives.
+    Data queued there is stale when it arrives.
     """
     connection = transport.get_extra_info('socket') if transport is not None else None
     if connection is None:
@@ -326,4 +326,4 @@ def _prioritize(transport: asyncio.BaseTransport | None) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, 25, 16 << 10)  # TCP_NOTSENT_LOWAT
         if connection.family == socket.AF_INET6:
             connection.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS, AF41)
-        connection.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, AF41)  # of an IPv6 socket too, which may carry IPv4
+        connection.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, AF41)  # also for an IPv6 socket, which may carry IPv4

@@ -1,10 +1,13 @@
-"""The camera as video over WebRTC, encoded once for all who take it. Importing this loads aiortc (the extra ``webrtc``).
+"""The camera as video over WebRTC, encoded once for all viewers. Importing this loads aiortc (the extra ``webrtc``).
 
 The newest JPEG of a topic is decoded and encoded as VP8 on a separate thread; its packets are sent to each peer. RTP timestamps
-are the times of arrival, at 90 kHz, so the page knows how old each frame is. Packets are sent to the viewer's own address only:
-candidates of an offer give ports and no addresses, and no STUN server is asked. aiortc has no interface for three things that are
-needed: the rate that a receiver can take, when it lacks a key frame, and where timestamps begin. They are read from the private
-attributes of the versions that setup.py names.
+are
+the times of arrival, at 90 kHz, so the page knows the age of each frame. Packets are sent only to the viewer's own address:
+candidates of an offer contribute ports and no addresses, and no STUN server is used. aiortc has no interface for three things
+that
+are needed: the receiver's bandwidth estimate, its requests for key frames, and the start of timestamps. They are read from
+private
+attributes of the versions pinned in setup.py.
 """
 
 from __future__ import annotations
@@ -40,31 +43,31 @@ MAX_PEERS: Final = 8
 MAX_ENCODED: Final = 2
 """Topics that are encoded at a time."""
 MAX_SIDE: Final = 1920
-"""Pixels; of a larger frame no more is encoded than these."""
+"""Maximum side in pixels; larger frames are reduced."""
 CLOCK_HZ: Final = 90_000
 """Of RTP timestamps of video (RFC 7741)."""
 MIN_RATE, FIRST_RATE, MAX_RATE = 150_000, 500_000, 1_500_000
-"""Bits a second of a topic."""
+"""Bitrate of a topic."""
 RATE_SHARE: Final = 0.85
-"""Of what a receiver says that its link carries."""
+"""Share of the receiver's estimated bandwidth."""
 RAISE_EVERY_S: Final = 4.0
-"""A new rate begins with a key frame, so a better one waits."""
+"""A new rate starts with a key frame, so increases are delayed."""
 MAX_WAITING: Final = 10
-"""Packets of a peer whose turn does not come; then it goes on with the next key frame."""
+"""Maximum packets queued for a peer; then it continues with the next key frame."""
 CONNECT_S: Final = 10.0
 VP8: Final = 'video/VP8'
 KEY_EVERY_S: Final = 0.7
-"""Key frames that receivers request are sent no more often."""
+"""Minimum interval between key frames that receivers request."""
 _TICKS_PER_MS: Final = CLOCK_HZ // 1000
 _CANDIDATE: Final = re.compile(r'a=candidate:\S+ 1 udp \d+ \S+ (\d{1,5}) typ host', re.IGNORECASE)
 _MAX_CANDIDATES: Final = 8
 _BROKEN: Final = (InvalidAccessError, InvalidStateError, OperationError, ValueError, LookupError, TypeError, AttributeError,
                   AssertionError, OSError, RuntimeError)  # fmt: skip
-"""What aiortc raises for an offer that is none."""
+"""Errors of aiortc for an invalid offer."""
 
 
 class OfferRefused(Exception):
-    """A viewer cannot take video; the text says why."""
+    """A viewer cannot take video; the text has the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +76,14 @@ class _Encoded:
     """av.Packet."""
     at_ms: float
     is_key: bool
-    """Whether it needs no other."""
+    """Whether it is independent of other frames."""
 
 
 class _Vp8Encoder:
-    """Makes VP8 of the newest JPEG of a topic, on the thread ``video``. The condition guards what waits and what is asked for."""
+    """Encodes the newest JPEG of a topic as VP8, on the thread ``video``. The condition guards the waiting frame and requests."""
 
-    def __init__(self, made: Callable[[_Encoded], None]) -> None:
-        self._made = made
+    def __init__(self, on_encoded_frame: Callable[[_Encoded], None]) -> None:
+        self._on_encoded_frame = on_encoded_frame
         self._changed = Condition()
         self._waiting: tuple[float, bytes] | None = None
         self._wants_key = True
@@ -89,7 +92,7 @@ class _Vp8Encoder:
         self._codec: Any = None
         self._last_pts = -1
         self.encoded = self.keys = 0
-        """Frames so far, and those of them that need no other."""
+        """Frames so far, and the key frames among them."""
         self.worker = Worker('video', self._step)
 
     def open(self) -> None:
@@ -113,7 +116,7 @@ class _Vp8Encoder:
         with self._changed:
             self._changed.notify()
         if not await asyncio.to_thread(self.worker.join, 5.0):
-            log.warning('the thread that encodes video does not end')
+            log.warning('the thread that encodes video does not stop')
 
     def _step(self) -> None:
         with self._changed:
@@ -129,7 +132,7 @@ class _Vp8Encoder:
         try:
             frame = _frame(jpeg)
         except ValueError:
-            return  # the age of the last one that was good is on the page
+            return  # the page shows the age of the last valid one
         pts = round(at_ms * _TICKS_PER_MS)
         if pts <= self._last_pts:
             return
@@ -142,7 +145,7 @@ class _Vp8Encoder:
             packet.pts, packet.time_base = pts, frame.time_base
             self.encoded += 1
             self.keys += bool(packet.is_keyframe)
-            self._made(_Encoded(packet, at_ms, bool(packet.is_keyframe)))
+            self._on_encoded_frame(_Encoded(packet, at_ms, bool(packet.is_keyframe)))
 
     def _codec_for(self, frame: Any, rate: int) -> Any:
         codec = self._codec
@@ -164,9 +167,9 @@ def _frame(jpeg: bytes) -> Any:
     """A frame (av.VideoFrame, yuv420p) with even sides of at most MAX_SIDE pixels. Raises ValueError."""
     height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
     check_pixels(width, height)
-    least = -(-max(height, width) // MAX_SIDE)
+    min_side = -(-max(height, width) // MAX_SIDE)
     pixels = simplejpeg.decode_jpeg(jpeg, 'RGB', fastdct=True, fastupsample=True,
-                                    min_height=height // least, min_width=width // least)  # fmt: skip
+                                    min_height=height // min_side, min_width=width // min_side)  # fmt: skip
     every = -(-max(pixels.shape[:2]) // MAX_SIDE)
     pixels = pixels[::every, ::every]
     height, width = (side - side % 2 for side in pixels.shape[:2])
@@ -176,7 +179,7 @@ def _frame(jpeg: bytes) -> Any:
 
 
 class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
-    """What one peer is sent: packets that all peers of a topic share."""
+    """The track of one peer: packets that all peers of a topic share."""
 
     kind = 'video'
 
@@ -186,12 +189,12 @@ class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
         self._waiting: asyncio.Queue[_Encoded] = asyncio.Queue()
         self._last: _Encoded | None = None
         self._needs_key = True
-        self._is_asked = False
+        self._key_requested = False
 
     async def recv(self) -> Any:
-        """Called by the sender, once it is connected, for each packet after the one before was sent."""
-        if not self._is_asked:
-            self._is_asked = True
+        """Called by the sender, once it is connected, for each packet after the previous one was sent."""
+        if not self._key_requested:
+            self._key_requested = True
             self._ask_key()
         if self._last is not None:
             self._sent(self._last)
@@ -199,7 +202,7 @@ class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
         return self._last.packet
 
     def offer(self, encoded: _Encoded) -> None:
-        if not self._is_asked:
+        if not self._key_requested:
             return
         if self._waiting.qsize() >= MAX_WAITING:
             while not self._waiting.empty():
@@ -220,9 +223,9 @@ class _Peer:
         self.pc = RTCPeerConnection(RTCConfiguration(iceServers=[]))
         self.track = _PacketTrack(lambda: video.ask_key(self), self._on_sent)
         self.rate: float | None = None
-        """Bits a second that its link carries, as it says."""
+        """Estimated bandwidth of its link, bits per second."""
         self.is_answered = False
-        self._is_told = False
+        self._has_reported = False
         self.sender: RTCRtpSender = self.pc.addTrack(self.track)
 
     async def answer(self, offer: str, own: str, remote: str) -> str:
@@ -249,8 +252,8 @@ class _Peer:
             self._video.lost(self, 'the connection for video (UDP) was lost')
 
     def _on_sent(self, encoded: _Encoded) -> None:
-        if not self._is_told:
-            self._is_told = True
+        if not self._has_reported:
+            self._has_reported = True
             self._tell({'rtp': self.sender._RTCRtpSender__rtp_timestamp, 'at': encoded.at_ms, 'topic': self.topic})
 
     def _on_rtcp(self, packet: Any) -> None:
@@ -266,7 +269,7 @@ class _Peer:
 class CameraVideo:
     """Encodes the topics that peers take, and sends them. Used by one event loop. New; close once.
 
-    ``changed`` is called when other topics are to be read than before.
+    ``changed`` is called when the set of topics to read changes.
     """
 
     def __init__(self, changed: Callable[[], None]) -> None:
@@ -282,7 +285,7 @@ class CameraVideo:
 
     @property
     def topics(self) -> frozenset[str]:
-        """Those that somebody takes."""
+        """The topics in use."""
         return frozenset(peer.topic for peer in self._peers.values())
 
     def offer(self, item: LiveItem) -> None:
@@ -294,34 +297,35 @@ class CameraVideo:
         if (encoder := self._encoders.get(peer.topic)) is not None:
             encoder.ask_key()
 
-    async def take(self, who: object, said: Mapping[str, Any], addresses: tuple[str, str],
+    async def take(self, who: object, request: Mapping[str, Any], addresses: tuple[str, str],
                    tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
-        """A viewer asks for a topic: ``said`` has ``topic`` and ``offer`` (SDP). ``tell`` is given the answer, or the problem.
+        """A viewer requests a topic: ``request`` has ``topic`` and ``offer`` (SDP). ``tell`` is called with the answer, or the
+        problem.
 
-        ``addresses``: at which of ours it reached us, and its own.
+        ``addresses``: our address that it connected to, and its own.
         """
         self.end(who)
         try:
-            peer = self._new_peer(who, said.get('topic'), tell)
-            answer = await self._answered(who, peer, said.get('offer'), addresses)
+            peer = self._new_peer(who, request.get('topic'), tell)
+            answer = await self._answered(who, peer, request.get('offer'), addresses)
         except OfferRefused as error:
             tell({'problem': str(error)})
         else:
             tell({'answer': answer})
-            self._loop.call_later(CONNECT_S, self._look_at, peer)
+            self._loop.call_later(CONNECT_S, self._check_connection, peer)
 
     def _new_peer(self, who: object, topic: Any, tell: Callable[[Mapping[str, Any]], None]) -> _Peer:
         if not isinstance(topic, str):
-            raise OfferRefused('a viewer takes a topic')
+            raise OfferRefused('topic is missing in the request')
         if len(self._peers) >= MAX_PEERS:
-            raise OfferRefused(f'{MAX_PEERS} viewers take video, which is the most there may be')
+            raise OfferRefused(f'{MAX_PEERS} viewers take video, which is the maximum')
         if topic not in self.topics and len(self.topics) >= MAX_ENCODED:
-            raise OfferRefused(f'{MAX_ENCODED} cameras are encoded, which is the most there may be')
+            raise OfferRefused(f'{MAX_ENCODED} cameras are encoded, which is the maximum')
         peer = self._peers[who] = _Peer(topic, self, tell)
         return peer
 
     async def _answered(self, who: object, peer: _Peer, offer: Any, addresses: tuple[str, str]) -> str:
-        """Whatever goes wrong, the peer is ended. Raises OfferRefused."""
+        """On any failure the peer is closed. Raises OfferRefused."""
         answer = None
         try:
             answer = await peer.answer(offer, *map(_plain, addresses))
@@ -334,7 +338,7 @@ class CameraVideo:
         return answer
 
     def end(self, who: object) -> None:
-        """It takes no video any more."""
+        """The viewer stops its video."""
         if (peer := self._peers.pop(who, None)) is not None:
             self._follow()
             self._end(peer.pc.close())
@@ -351,11 +355,11 @@ class CameraVideo:
                 self.end(who)
 
     def has(self, who: object) -> bool:
-        """Whether it takes video, and is connected."""
+        """Whether the viewer takes video, and is connected."""
         return (peer := self._peers.get(who)) is not None and peer.pc.connectionState == 'connected'
 
     def tick(self) -> None:
-        """Once a second: the rate of each topic is what the slowest of its links carries."""
+        """Once per second: the rate of each topic is what the slowest of its links carries."""
         now_s = time.monotonic()
         for topic, encoder in self._encoders.items():
             told = [peer.rate for peer in self._peers.values() if peer.topic == topic and peer.rate is not None]
@@ -373,12 +377,12 @@ class CameraVideo:
         if self._ending:
             await asyncio.wait(self._ending, timeout=5.0)
 
-    def _look_at(self, peer: _Peer) -> None:
+    def _check_connection(self, peer: _Peer) -> None:
         if peer.pc.connectionState != 'connected':
             self.lost(peer, f'no connection for video (UDP) within {CONNECT_S:.0f} s')
 
     def _follow(self) -> None:
-        """Encoders of the topics that are taken, and no others."""
+        """Keep encoders exactly for the topics in use."""
         wanted = {peer.topic for peer in self._peers.values() if peer.is_answered}
         for topic in self._encoders.keys() - wanted:
             self._rates.pop(topic, None)
@@ -400,16 +404,16 @@ class CameraVideo:
 
 
 def _plain(address: str) -> str:
-    """An address without the form that IPv4 has on a socket of IPv6."""
+    """An address, with IPv4-mapped IPv6 as IPv4."""
     mapped = getattr(ip_address(address.partition('%')[0]), 'ipv4_mapped', None)
     return address if mapped is None else str(mapped)
 
 
 def _with_address(offer: str, remote: str) -> str:
-    """The offer with candidates at the viewer's own address alone; browsers put names that few can look up in its place."""
-    lines = offer.splitlines()  # as aiortc takes them apart
+    """The offer with candidates only at the viewer's own address; browsers replace addresses by names that few can resolve."""
+    lines = offer.splitlines()  # split as in aiortc
     if [line[:8] for line in lines if line.startswith('m=')] != ['m=video ']:
-        raise OfferRefused('an offer has one part, which is video')
+        raise OfferRefused('an offer must have one part, which is video')
     ports = [int(found[1]) for line in lines if (found := _CANDIDATE.match(line)) and 0 < int(found[1]) < 65_536]
     lines = [line for line in lines if not line.startswith(('a=candidate', 'a=end-of-candidates', 'a=remote-candidates'))]
     ports = ports[:_MAX_CANDIDATES] or [9]  # without any, the answering side would not wait for the other
@@ -418,7 +422,7 @@ def _with_address(offer: str, remote: str) -> str:
 
 
 def _gather_at(connection: Any, address: str) -> None:
-    """Let an ICE connection (aioice) listen at this address alone, and not at all but the loopback's, as it would."""
+    """Make an ICE connection (aioice) listen only at this address; by default it skips loopback."""
     gather: Callable[..., Awaitable[list[Any]]] = connection.get_component_candidates
 
     async def at_address(component: int, addresses: list[str], timeout: int = 5) -> list[Any]:  # noqa: ARG001 - as aioice has it

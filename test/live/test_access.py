@@ -23,7 +23,7 @@ from shadowhound_data_logger.live import acts as acts_module
 from shadowhound_data_logger.live import answers as answers_module
 from shadowhound_data_logger.live import server as module
 from shadowhound_data_logger.live import viewers as viewers_module
-from shadowhound_data_logger.live.access import ENDED_FILE, LASTS_S, MAX_FAILURES, Access, OwnNames, TokenRefused, make_tokens
+from shadowhound_data_logger.live.access import LASTS_S, MAX_FAILURES, SIGN_OUTS_FILE, Access, OwnNames, TokenRefused, make_tokens
 from shadowhound_data_logger.live.auth import MAX_BODY
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 from shadowhound_data_logger.live.viewers import MAX_MESSAGE, MAX_VIEWERS
@@ -293,7 +293,7 @@ class Door:
         return True
 
     def lets_in(self, address: str) -> bool:
-        token = access_module.token_of(self.paths[access_module.OPERATOR])
+        token = access_module.read_token(self.paths[access_module.OPERATOR])
         return not self.access.wait_s(address) and self.access.sign_in(token, address) is not None
 
 
@@ -343,7 +343,7 @@ def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, mon
             assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
             assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
             assert (await page.ask('operator', 'GET', '/api/session'))[0] == 200
-            make_tokens(page.folder, anew=True)
+            make_tokens(page.folder, replace=True)
             assert (await page.ask('operator', 'GET', '/api/session'))[0] == 401
 
     asyncio.run(run())
@@ -401,7 +401,7 @@ def test_a_sign_in_is_not_refused_where_the_disk_does_not_keep_the_end_of_anothe
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
-            (page.folder / f'viewer.{ENDED_FILE}.part').mkdir()
+            (page.folder / f'viewer.{SIGN_OUTS_FILE}.part').mkdir()
             body = json.dumps({'token': page.token('operator')}).encode()
             assert (await page.ask('viewer', 'POST', '/api/session', body=body))[0] == 200
             assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
@@ -442,7 +442,7 @@ def test_a_sign_out_outlasts_a_restart(tmp_path: Path, monkeypatch: pytest.Monke
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
             assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
-            assert stat.S_IMODE((page.folder / f'viewer.{ENDED_FILE}').stat().st_mode) == 0o600
+            assert stat.S_IMODE((page.folder / f'viewer.{SIGN_OUTS_FILE}').stat().st_mode) == 0o600
             cookies = dict(page.cookies)
         async with serving(tmp_path, monkeypatch) as page:
             page.cookies = cookies
@@ -459,7 +459,7 @@ def test_a_sign_out_that_the_disk_refuses_is_told(
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
-            (page.folder / f'viewer.{ENDED_FILE}.part').mkdir()
+            (page.folder / f'viewer.{SIGN_OUTS_FILE}.part').mkdir()
             status, _, body = await page.ask('viewer', 'POST', '/api/sign-out')
             assert (status, b'until this page restarts' in body) == (503, True)
             assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
@@ -482,7 +482,7 @@ def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monk
             await answers(operator, 1)
             token = page.folder / 'viewer.token'
             if how == 'new tokens':
-                make_tokens(page.folder, anew=True)
+                make_tokens(page.folder, replace=True)
             elif how == 'others may read it':
                 token.chmod(0o644)
             elif how == 'it is gone':
@@ -662,7 +662,7 @@ def test_whoever_asks_for_nothing_keeps_nobody_out(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ('mode', 'text', 'why'), [(0o640, 'a' * 30, 'for its owner alone'), (0o600, 'short', 'no token of at least')]
+    ('mode', 'text', 'why'), [(0o640, 'a' * 30, 'restricted to its owner'), (0o600, 'short', 'no token of at least')]
 )
 def test_a_token_that_others_know_is_refused(tmp_path: Path, mode: int, text: str, why: str) -> None:
     """The start says which file and what to do."""
@@ -716,7 +716,7 @@ class Signing:
     @property
     def entries(self) -> int:
         """Of the file, each of which has a line; the first two are none."""
-        return len((self.folder / f'viewer.{ENDED_FILE}').read_text().splitlines()) - 2
+        return len((self.folder / f'viewer.{SIGN_OUTS_FILE}').read_text().splitlines()) - 2
 
 
 def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> None:
@@ -739,7 +739,7 @@ def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> N
 
 def test_what_is_remembered_of_sign_outs_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the most there may be the oldest leave, and nobody of theirs comes back; what has expired leaves by itself."""
-    monkeypatch.setattr(access_module, 'MAX_ENDED', 3)
+    monkeypatch.setattr(access_module, 'MAX_SIGN_OUTS', 3)
     it = Signing(tmp_path)
     access = it.access()
     ended = []
@@ -764,7 +764,7 @@ def test_a_viewer_who_signs_out_again_and_again_ends_no_operator_s_sign_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is remembered beyond the most there may be counts for the role alone."""
-    monkeypatch.setattr(access_module, 'MAX_ENDED', 3)
+    monkeypatch.setattr(access_module, 'MAX_SIGN_OUTS', 3)
     it = Signing(tmp_path)
     access = it.access()
     operator = access.sign_in(it.tokens['operator'].read_text().strip(), '10.0.0.1')
@@ -780,7 +780,7 @@ def test_a_viewer_who_signs_in_again_and_again_over_himself_ends_no_operators_si
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of his own sign-ins the last one is left, also when all came within a second."""
-    monkeypatch.setattr(access_module, 'MAX_ENDED', 3)
+    monkeypatch.setattr(access_module, 'MAX_SIGN_OUTS', 3)
     it = Signing(tmp_path)
     access = it.access()
     tokens = {role: path.read_text().strip() for role, path in it.tokens.items()}
@@ -802,12 +802,12 @@ def test_a_clock_that_was_ahead_makes_no_cookie_for_years(tmp_path: Path) -> Non
     """Damage that is found then ends all sign-ins until then; it is said what to do, and new tokens are a way out."""
     it = Signing(tmp_path)
     it.now[0] += 70 * 365 * 86400.0
-    (tmp_path / f'viewer.{ENDED_FILE}').write_bytes(b'damaged')
+    (tmp_path / f'viewer.{SIGN_OUTS_FILE}').write_bytes(b'damaged')
     it.cookie(it.access())
     it.now[0] -= 70 * 365 * 86400.0
     with pytest.raises(TokenRefused, match='the clock was ahead'):
         it.cookie(it.access())
-    it.tokens = make_tokens(tmp_path, anew=True)
+    it.tokens = make_tokens(tmp_path, replace=True)
     access = it.access()
     found = access.who(it.cookie(access))
     assert found is not None
@@ -826,14 +826,14 @@ def test_damage_lets_nobody_in_and_locks_nobody_out(
     access = it.access()
     ended, living = it.cookie(access), it.cookie(access)
     it.sign_out(access, ended)
-    path = tmp_path / f'viewer.{ENDED_FILE}'
+    path = tmp_path / f'viewer.{SIGN_OUTS_FILE}'
     path.write_bytes(damage(path.read_bytes()))
     after = it.access()
     again = it.cookie(after)  # the very first request, within the same second
     for each in (after, it.access()):
         assert [each.who(cookie) is not None for cookie in (ended, living, again)] == [False, False, True]
     assert [record.levelname for record in caplog.records] == ['WARNING']
-    assert 'whoever has a token signs in again' in caplog.text
+    assert 'sign in again with the token' in caplog.text
 
 
 def test_a_sign_in_of_a_role_whose_token_is_good_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -848,7 +848,7 @@ def test_a_sign_in_of_a_role_whose_token_is_good_goes_on(tmp_path: Path, caplog:
         assert access.who(operator[1]) == operator[0]
         assert access.who(viewer) is None
         assert access.sign_in(it.tokens['viewer'].read_text().strip(), '10.0.0.1') is None
-    assert ['not for its owner alone' in record.getMessage() for record in caplog.records] == [True]
+    assert ['not restricted to its owner' in record.getMessage() for record in caplog.records] == [True]
     it.tokens['viewer'].chmod(0o600)
     assert access.who(viewer) is not None
 

@@ -643,7 +643,7 @@ def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path:
         sign_in()
         holds(page, 'shadowhound.count.figures > 0')
         page.evaluate('window.same = true')
-        make_tokens(tmp_path / 'live', anew=True)
+        make_tokens(tmp_path / 'live', replace=True)
         page.get_by_text('Your sign-in has ended.').wait_for()
         before = len(tried)
         page.wait_for_timeout(4000)  # it would have tried three times
@@ -697,7 +697,7 @@ def test_where_everybody_may_watch_an_operator_becomes_a_viewer(
         page.locator('[data-act=flush]').wait_for()
         page.reload()  # with the cookie, by which the connection is known
         page.locator('[data-act=flush]').wait_for()
-        make_tokens(tmp_path / 'live', anew=True)
+        make_tokens(tmp_path / 'live', replace=True)
         page.locator('[data-act=flush]').wait_for(state='detached')
         count = counted(page, 'figures')
         holds(page, f'shadowhound.count.figures > {count}')

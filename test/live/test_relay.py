@@ -139,11 +139,11 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
     monkeypatch.setattr(relay, 'LOOK_S', 0.01)
     looks: list[str] = []
 
-    def token_of(path: Path) -> str:
+    def read_token(path: Path) -> str:
         looks.append(path.read_text())
-        return access.token_of(path)
+        return access.read_token(path)
 
-    monkeypatch.setattr(relay, 'token_of', token_of)
+    monkeypatch.setattr(relay, 'read_token', read_token)
 
     async def run() -> None:
         async with serving(tmp_path / 'robot', monkeypatch) as robot:
@@ -161,25 +161,25 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
                     return told
 
                 await until(lambda: problem() == '' and robot.server.viewers.connected)
-                make_tokens(robot.folder, anew=True)
-                await until(lambda: 'refuses the token' in (problem() or ''))
+                make_tokens(robot.folder, replace=True)
+                await until(lambda: 'rejects the token' in (problem() or ''))
                 looks.clear()
                 await until(lambda: len(looks) > 50)
                 assert len(robot.server.auth.access._failures['127.0.0.1']) == 1
                 token.write_text('')  # it is being replaced
-                await until(lambda: 'holds no token' in (problem() or ''))
+                await until(lambda: 'contains no token' in (problem() or ''))
                 token.write_text(robot.token('viewer'))
                 await until(lambda: problem() == '' and robot.server.viewers.connected)
                 assert len(robot.server.auth.access._failures.get('127.0.0.1', ())) == 0
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
-        assert sum('refuses the token' in text for text in caplog.messages) == 1
+        assert sum('rejects the token' in text for text in caplog.messages) == 1
 
     asyncio.run(run())
 
 
 @pytest.mark.parametrize(('path', 'status', 'why'), [
-    ('/api/session', 429, 'too many wrong tokens'), ('/ws', 401, 'asks for a token'), ('/ws', 429, 'no more viewers'),
+    ('/api/session', 429, 'too many wrong tokens'), ('/ws', 401, 'requires a token'), ('/ws', 429, 'no more viewers'),
 ])  # fmt: skip
 def test_a_robot_that_lets_nobody_in_is_left_alone_for_a_while(
     path: str, status: int, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -65,7 +65,7 @@ def test_the_password_is_in_a_file_of_its_owner(tmp_path: Path) -> None:
     assert len(first) > 20
     assert rtsp_password(tmp_path) == first
     assert stat.S_IMODE((tmp_path / 'rtsp.password').stat().st_mode) == 0o600
-    make_tokens(tmp_path, anew=True)
+    make_tokens(tmp_path, replace=True)
     assert rtsp_password(tmp_path) != first
 
 
