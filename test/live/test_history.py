@@ -474,7 +474,7 @@ def test_a_store_that_is_away_delays_no_timeline(opened: Opened, store: ObjectSt
     patrol(store, tmp_path)
     answers = threading.Event()
     monkeypatch.setattr(module, 'LABELS_S', 0.01)
-    monkeypatch.setattr(module, '_labels_of', lambda _: answers.wait(60) and [])
+    monkeypatch.setattr(module, '_read_labels', lambda _: answers.wait(60) and [])
     noon = NOON_NS // 1_000_000
     try:
         found, _ = opened(StorePast()).answer({'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000})

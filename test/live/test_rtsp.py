@@ -50,7 +50,7 @@ def progressive() -> bytes:
 
 @pytest.mark.parametrize(('picture', 'word'), [
     (jpeg(480, 640), ''), (jpeg(480, 640, '422'), ''), (jpeg(8, 2040), ''), (jpeg(480, 640, '444'), '444'),
-    (jpeg(481, 640), '481'), (jpeg(8, 2048), '2048'), (b'', 'no JPEG'), (progressive(), 'baseline'),
+    (jpeg(481, 640), '481'), (jpeg(8, 2048), '2048'), (b'', 'not a JPEG'), (progressive(), 'baseline'),
 ])  # fmt: skip
 def test_what_rfc_2435_cannot_send_is_said(picture: bytes, word: str) -> None:
     """Sizes, sampling and coding of a JPEG decide."""
