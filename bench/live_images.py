@@ -24,7 +24,8 @@ from typing import Any
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
-sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
+sys.path.remove(str(Path(__file__).resolve().parent))  # it has a module lake, and test a folder lake
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 from domains import free_domain
 from e2e.processes import COMMANDS, Processes
 from lake.gap_parts import IMU
@@ -37,8 +38,10 @@ from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, complete, date_
 from shadowhound_data_logger.stores import open_store
 
 FLAGS = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
-DESKTOP, PHONE = {'width': 1280, 'height': 1000}, {'width': 390, 'height': 844}
+DESKTOP, TALL, PHONE = ({'width': width, 'height': height} for width, height in ((1280, 1000), (1280, 1400), (390, 844)))
 PARAMETERS = {'events.topics': ['/imu', '/camera/compressed'], 'events.pre_s': 3.0, 'events.post_s': 2.0}
+RATES = 'rate_scale:=0.3'
+"""The browser draws without a graphics card, beside the simulator."""
 AWAY_S = 4.0
 """The node is killed for this long."""
 SETTLE_MS = 4000
@@ -65,7 +68,7 @@ def robot(browser: Browser, folder: Path, to: Path, seconds: float) -> None:
         processes = Processes(folder, domain, f'r{secrets.token_hex(4)}')
         try:
             node = processes.node(parameters=PARAMETERS, robot='rover')
-            processes.sim()
+            processes.sim(RATES)
             time.sleep(seconds)
             node.kill()
             time.sleep(AWAY_S)
@@ -90,6 +93,7 @@ def robot(browser: Browser, folder: Path, to: Path, seconds: float) -> None:
             page.locator('.chosen').wait_for()
             shot(page, to / 'live_gap.jpg')
             page.locator('[data-jump="event 1"]').click()
+            page.set_viewport_size(TALL)
             shot(page, to / 'live_past.jpg')
             page.context.close()
         finally:
@@ -117,7 +121,7 @@ def fleet(browser: Browser, folder: Path, to: Path) -> None:
                 body = parts.encode([one for one in said if date_of(one) == date], GAPS)
                 add(store, folder / 'tmp', GAPS.part_key(name, date, 'a'), body, {'robot': name})
     with served(home) as url:
-        page = opened(browser, url, DESKTOP)
+        page = opened(browser, url, {**DESKTOP, 'height': 790})
         page.locator('tr[data-robot]:not([data-state=unknown])').first.wait_for()
         shot(page, to / 'live_fleet.jpg')
         page.context.close()

@@ -292,11 +292,10 @@ export function Timeline({ session }) {
   const seen = new Map();
   const shades = [...new Map([...gaps, ...(chosen ? [chosen] : [])].map(({ cause }) => [shade(cause).join(), shade(cause)])).values()];
   for (const gap of gaps) {
-    const name = `${gap.kind} ${gap.cause}`;
-    const known = seen.get(name) ?? { ...gap, messages: 0, rows: 0 };
+    const known = seen.get(gap.cause) ?? { cause: gap.cause, messages: 0, kinds: new Set() };
     known.messages += gap.count;
-    known.rows += 1;
-    seen.set(name, known);
+    known.kinds.add(gap.kind);
+    seen.set(gap.cause, known);
   }
 
   const clear = () => {
@@ -304,14 +303,15 @@ export function Timeline({ session }) {
     setBegin(null);
   };
   const pick = (ms) => {
+    setChosen(null);
+    setLate(null);
     if (!isPast && ms < from) look(robot, ms - (to - from) / 2, ms + (to - from) / 2);
     else if (!isPast) look(robot, from, Math.max(to, ms));
     go(robot, Math.min(ms, now || ms));
   };
   const show = (gap) => {
-    setChosen(gap);
-    setLate(null);
     pick(gap.from);
+    setChosen(gap);
   };
   const down = (event) => {
     const place = event.clientX - box.current.getBoundingClientRect().left;
@@ -347,8 +347,8 @@ export function Timeline({ session }) {
     if (!doing || doing.moved || doing.what !== 'pan') return;
     if (doing.gap) show(doing.gap);
     else {
-      setLate(doing.late ?? null);
       pick(doing.ms);
+      setLate(doing.late ?? null);
     }
   };
   const jump = async (what, direction) => {
@@ -480,7 +480,7 @@ export function Timeline({ session }) {
       ${kept.length > 0 && html`<span title="Only the robot has it; an operator can request it"><i class="swatch kept"></i>kept on the robot</span>`}
       <span title="The robot has accounted for every message of this time"><i class="swatch known"></i>nothing else is missing</span><span title="The robot has not reported that far, or was off"><i class="swatch unknown"></i>not known yet</span>
       ${deliveries.length > 0 && html`<span title="It reached the store more than half a minute after it was recorded"><i class="swatch late"></i>delivered late</span><span title="It is on the robot and waits for the store"><i class="swatch waits"></i>waits</span>`}
-      ${[...seen.values()].map((each) => html`<span title=${meaning(each.cause)}><${Swatch} cause=${each.cause} />${each.kind}: ${each.cause.replaceAll('_', ' ')} <b>${digits(each.messages)}</b></span>`)}
+      ${[...seen.values()].map((each) => html`<span title=${`Messages that are lost: ${[...each.kinds].join(', ')} (${each.cause || 'unknown'})`}><${Swatch} cause=${each.cause} />${meaning(each.cause)} <b>${digits(each.messages)}</b></span>`)}
       ${['mission', 'bag', 'event', 'label'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span title=${MARKED[kind]}><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}
       ${found && !gaps.length && topics.length > 0 && html`<span class="good">no gap is known in this time</span>`}
       ${topics.length > 0 && html`<span class="unit">${isPast ? 'click: that moment · wheel: zoom · drag: move · shift-drag: select' : 'click on a time to see it again'}</span>`}
@@ -489,8 +489,8 @@ export function Timeline({ session }) {
       <p class="row"><button type="button" onClick=${() => show(chosen)}>Show the moment before</button>${isPast && html`<button type="button" onClick=${() => { setBegin(null); selection.value = { from: chosen.from, to: chosen.to }; }}>Select this time</button>`}</p></${GapWords}>`}
     ${late && html`<p class="chosen" aria-live="polite" data-late-words>Recorded ${clock(late[0])} to ${clock(late[1])}, ${late[2] === null ? 'and some of it still waits on the robot' : html`and delivered until ${clock(late[2])}, up to ${span((late[2] - late[0]) / 1000)} later`}: the store could not be reached then, or uploads had to wait. It waited on the robot's disk; what is lost is drawn as a gap.</p>`}
     ${isPast && html`<${Commands} session=${session} robot=${robot} selected=${selected} />`}
-    ${gaps.length > 0 && html`<details><summary>All ${gaps.length} gaps as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
+    ${gaps.length > 0 && html`<details><summary>${gaps.length === 1 ? 'The gap' : `All ${gaps.length} gaps`} as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
       <th class="n">Messages</th><th>What</th><th>Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td><button type="button" class="link" onClick=${() => show(gap)}>${clock(gap.from)}</button></td>
-      <td class="n">${span((gap.to - gap.from) / 1000)}</td><td class="n">${digits(gap.count)}</td><td>${gap.kind}</td><td>${gap.cause.replaceAll('_', ' ')}</td></tr>`)}</tbody></table></div></details>`}
+      <td class="n">${span((gap.to - gap.from) / 1000)}</td><td class="n">${digits(gap.count)}</td><td>${gap.kind}</td><td title=${gap.cause}>${meaning(gap.cause)}</td></tr>`)}</tbody></table></div></details>`}
   </div>${isPast && !session.has_live && robots.value.length === 1 && html`<${Fleet} chosen=${robot} names=${robots.value} />`}`;
 }
