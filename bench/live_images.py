@@ -45,6 +45,7 @@ RATES = 'rate_scale:=0.3'
 AWAY_S = 4.0
 """The node is killed for this long."""
 SETTLE_MS = 4000
+FRESH_S = 60.0
 FLEET = (('rover', 20, 0), ('loki', 40, 1840), ('odin', 3 * 3600, 0), ('freya', 26 * 3600, 0), ('thor', 90, 12))
 """Robots: seconds since the last object, messages that are missing today."""
 
@@ -160,7 +161,11 @@ def signed_in(page: Page, token: str) -> None:
 
 
 def shot(page: Page, path: Path) -> None:
+    """Once nothing on the page is marked as old: a busy machine shows some things late."""
     page.wait_for_timeout(SETTLE_MS)
+    end_s = time.monotonic() + FRESH_S
+    while page.locator('.age.old').count() and time.monotonic() < end_s:
+        page.wait_for_timeout(200)
     page.evaluate("scrollTo({top: 0, behavior: 'instant'})")
     page.wait_for_timeout(500)
     page.screenshot(path=path, type='jpeg', quality=80, timeout=120_000)
