@@ -41,7 +41,6 @@ class MissionRecorder:
         self._journal = journal
         self._policies = PolicyFolder(folder.path.parents[1])
         self._policy = policy
-        self._frames = copies.PreallocatedFiles(folder.files)
         self._numbers = count(1)
         self._lock = threading.Lock()
         self._unsynced: list[Path] = []
@@ -64,7 +63,9 @@ class MissionRecorder:
 
     def append_frame(self, data: memoryview, **fields: Any) -> None:
         """Store a JPEG and journal it. Raises OSError."""
-        self.append('frame', file=self._frames.write(data), **fields)
+        name = f'{next(self._numbers):08d}.jpg'
+        copies.write(self.folder.files / name, data)
+        self.append('frame', file=name, **fields)
 
     def append_copy(self, kind: str, path: str | os.PathLike[str], **fields: Any) -> None:
         """Copy a file and journal the copy. Raises Rejected for something other than a readable file, OSError."""
@@ -114,18 +115,15 @@ class MissionRecorder:
             self._journal.sync()
         except OSError as error:
             self._count_lost(error)
-        self._frames.fill()
 
     def close(self) -> None:
         """Sync and close the journal; idempotent."""
         self.sync()
-        self._frames.close()
         self._journal.close()
 
     def forget(self) -> None:
-        """In a forked child: only the parent logs, and it owns the preallocated files."""
+        """In a forked child: only the parent logs."""
         self._lock, self.has_ended = threading.Lock(), True
-        self._frames.forget()
 
     def warn(self, reason: str, text: str, *arguments: object) -> None:
         """Log a warning, once per reason."""

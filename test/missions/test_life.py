@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 from missions.fakes import journal, journalling
-from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.errors import SettingError
-from shadowhound_data_logger.missions.copies import PREALLOCATED
-from shadowhound_data_logger.missions.folder import MISSIONS, missions
+from shadowhound_data_logger.missions.folder import MISSIONS
 from shadowhound_data_logger.missions.mission import Mission
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
@@ -46,15 +44,14 @@ def _frame_in_a_fork(mission: Mission, path: Path) -> None:
 
 @pytest.mark.filterwarnings('ignore:This process .* is multi-threaded')
 def test_a_fork_touches_no_file_of_the_mission(tmp_path: Path) -> None:
-    """A child that has the mission itself in hand: neither the files made ahead nor new ones are written."""
+    """A child that has the mission itself in hand writes none."""
     with journalling(tmp_path) as logger, logger.mission('patrol', '') as mission:
         files = mission.folder.files
-        until(lambda: len(list(files.iterdir())) == PREALLOCATED, 'files are made ahead')
         child = multiprocessing.get_context('fork').Process(target=_frame_in_a_fork, args=(mission, Path(__file__)))
         child.start()
         child.join(60)
         assert child.exitcode == 0
-        assert {path.stat().st_size for path in files.iterdir()} == {0}
+        assert list(files.iterdir()) == []
         mission.log_camera_frame(JPEG, 0)
     assert [path.read_bytes() for path in files.iterdir()] == [JPEG]
 
@@ -114,21 +111,6 @@ def test_what_was_logged_reaches_the_disk_within_a_quarter_of_a_second(tmp_path:
         assert done.wait(60.0)
     start = synced.index('the frame')
     assert synced[start : start + 3] == ['the frame', 'files', 'journal']
-
-
-def test_frames_have_files_that_were_made_ahead(tmp_path: Path) -> None:
-    """What is not needed of them goes at the end, and a frame that arrives too early still gets a file."""
-    with journalling(tmp_path) as logger:
-        logger.start_mission('patrol', '')
-        (folder,) = missions(tmp_path)
-        until(lambda: len(list(folder.files.iterdir())) == PREALLOCATED, 'files are made ahead')
-        for number in range(3 * PREALLOCATED):
-            logger.log_camera_frame(JPEG + bytes([number]), number)
-    frames = {
-        record['id']: (folder.files / record['file']).read_bytes() for record in journal(tmp_path) if record['k'] == 'frame'
-    }
-    assert frames == {number: JPEG + bytes([number]) for number in range(3 * PREALLOCATED)}
-    assert len(list(folder.files.iterdir())) == len(frames)
 
 
 def test_a_disk_that_is_full_at_the_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
