@@ -226,7 +226,7 @@ class Recording:
         is_waiting = not state.is_named
         if has_slice:
             self._open_slice()  # its record describes the bag until the bag is complete in the spool
-        self._update(state.record(context.spool.owner, self.number))  # includes losses since the slice started
+        self._update(state.record(context.spool.robot, self.number))  # includes losses since the slice started
         try:
             self._release_slice()
             if (state.slices or state.missing) and not context.settle_name(state):
@@ -285,7 +285,7 @@ class Recording:
             path.with_name(path.name + OPEN_SUFFIX).unlink(missing_ok=True)  # left by a failed attempt
             writer = SliceWriter(path, compression=self._settings.compression, ros_distro=ros_distro())
             try:
-                writer.add_metadata(RECORD, self.state.record(self._context.spool.owner, self.number + 1))
+                writer.add_metadata(RECORD, self.state.record(self._context.spool.robot, self.number + 1))
                 writer.sync()
             except OSError:
                 writer.abort()

@@ -172,7 +172,7 @@ class BagRecovery:
         newest: dict[str, str] = {}
         for path in paths:
             record = {name: text for each in read_metadata(path, RECORD) for name, text in each.items()}
-            if (record.get('recording'), record.get('owner')) == (folder.name, spool.owner):
+            if (record.get('recording'), record.get('owner')) == (folder.name, spool.robot):
                 newest |= record
         state = BagState.of_record(folder, robot, newest) if newest else BagState(folder, folder.name, robot)
         for path in paths:

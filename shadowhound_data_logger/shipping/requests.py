@@ -12,21 +12,20 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from operator import itemgetter
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final
 
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import KeepSettings
 from shadowhound_data_logger.core.dataclass_json import as_plain
-from shadowhound_data_logger.core.errors import AccessDenied, DataLoggerError, ObjectRefused, StoreError
+from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, StoreError
 from shadowhound_data_logger.core.mailbox import (
     DEFAULT_EXPIRY_NS,
     DEFAULT_PRIORITY,
-    LATEST_NS,
     MAILBOX_BUCKET,
     MAX_INBOX_BYTES,
     LostObject,
@@ -44,6 +43,7 @@ from shadowhound_data_logger.core.mailbox import (
 from shadowhound_data_logger.core.model import DataObject, SpooledObject
 from shadowhound_data_logger.core.status import RequestStatus
 from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.shipping.slice_cuts import Cutter, SliceCuts
 from shadowhound_data_logger.spool.request_table import (
     ACTIVE,
     CANCELLED,
@@ -51,7 +51,6 @@ from shadowhound_data_logger.spool.request_table import (
     EXPIRED,
     REFUSED,
     KeptObject,
-    KeptSlice,
     RequestRow,
 )
 from shadowhound_data_logger.spool.spool import Spool
@@ -80,37 +79,6 @@ REMEMBER_NS: Final = 30 * 24 * 3600 * SECOND
 TIDY_S: Final = 60.0
 ANSWERS: Final = '_answers'
 """The sensor of answers."""
-CUT_S: Final = 0.05
-"""Of cutting, at each step: a fifth of the time."""
-
-
-class SliceCut(Protocol):
-    """A range of time from kept slices, as a separate bag (``bags/kept.py``)."""
-
-    @property
-    def slices(self) -> Sequence[KeptSlice]: ...
-
-    @property
-    def places(self) -> Sequence[tuple[str, str]]:
-        """(bucket, key) of the objects that it becomes, which no other content has."""
-
-    def work(self) -> Generator[None, None, list[DataObject]]:
-        """Cut, and yield after each piece of work; at last the objects. Raises DataLoggerError, OSError."""
-
-    def clear(self) -> None:
-        """Remove what it wrote and the spool did not take."""
-
-
-Cutter = Callable[[Sequence[KeptSlice], int, int, int], SliceCut]
-"""From slices of one bag and a range in Unix nanoseconds, with a priority."""
-
-
-class _Cutting(NamedTuple):
-    """The cut that is being made."""
-
-    row: RequestRow
-    cut: SliceCut
-    work: Generator[None, None, list[DataObject]]
 
 
 class RequestServer:
@@ -137,7 +105,6 @@ class RequestServer:
         self._clock = clock
         self._put = put
         self._released = released
-        self._cutter = cutter
         self._mbps = mbps
         self._may_send = may_send
         self._finished = finished
@@ -146,7 +113,7 @@ class RequestServer:
         self._version = ''
         self._poll_at_s = self._tidy_at_s = 0.0
         self._is_clear = False
-        self._cutting: _Cutting | None = None
+        self._cuts = SliceCuts(spool, cutter, released, self._serve, monotonic)
         self._answering: dict[str, int] = {}
         """Request -> the number of its answer that is on its way into the spool."""
         self._served: dict[str, float] = {}
@@ -197,7 +164,7 @@ class RequestServer:
             if row.is_open and row.expires_ns <= now_ns:
                 self._spool.requests.close(row.id, EXPIRED)
         rows = [row for row in rows if row.is_open and row.expires_ns > now_ns]
-        is_busy = self._may_send() and self._release(rows) | self._cut({row.id for row in rows})
+        is_busy = self._may_send() and self._release(rows) | self._cuts.work({row.id for row in rows})
         for row in self._spool.requests.rows():
             if row.answered_state != row.state or row.is_open:
                 self._answer(row)
@@ -346,71 +313,20 @@ class RequestServer:
         while len(chosen) < room and (row := self._next([row for row in rows if queues[row.id]])) is not None:
             number, size, is_cut = queues[row.id].popleft()
             if is_cut:
-                self._begin_cut(row)
+                self._cuts.begin(row)
                 continue
             if (count or chosen) and size > room_bytes:
                 break
             if number not in chosen:
                 chosen[number] = row.priority
                 room_bytes -= size
-                self._served[row.requester] += size / (10 - row.priority)
+                self._serve(row, size)
         if chosen:
             self._released(self._spool.kept.release(list(chosen.items())))
         return bool(chosen)
 
-    def _begin_cut(self, row: RequestRow) -> None:
-        """Start a cut, unless one is being made, of the oldest bag from which a request wants parts of slices."""
-        if self._cutting is not None or not (slices := self._spool.requests.to_cut(row.id)):
-            return
-        folder = slices[0].key.rpartition('/')[0]
-        wanted = json.loads(row.selection)
-        cut = self._cutter([each for each in slices if each.key.rpartition('/')[0] == folder], wanted.get('since_ns', 0),
-                           wanted.get('until_ns', LATEST_NS), row.priority)  # fmt: skip
-        if self._spool.has(*cut.places[-1]):  # for another request, or before the node died
-            self._set_cut(row, cut, cut.places)
-        else:
-            self._cutting = _Cutting(row, cut, cut.work())
-
-    def _cut(self, open_ids: Collection[str]) -> bool:
-        """Some of the work; whether there is any. Slices that cannot be cut are sent whole."""
-        if self._cutting is None:
-            return False
-        row, cut, work = self._cutting
-        if row.id not in open_ids:
-            self._cutting = None
-            work.close()
-            return False
-        end_s = self._monotonic() + CUT_S
-        try:
-            while self._monotonic() < end_s:
-                next(work)
-        except StopIteration as done:
-            self._cutting = None
-            self._take(row, cut, done.value)
-        except (DataLoggerError, OSError) as error:
-            self._cutting = None
-            self._send_whole(row, cut, error)
-        return True
-
-    def _take(self, row: RequestRow, cut: SliceCut, made: Sequence[DataObject]) -> None:
-        """The spool has what was cut, then the request does: a death between the two leaves it to be found."""
-        try:
-            placed = self._spool.commit(made)
-        except OSError as error:
-            self._send_whole(row, cut, error)
-            return
-        finally:
-            cut.clear()
-        self._set_cut(row, cut, [(item.bucket, item.key) for item in made])
-        self._released(placed)
-
-    def _set_cut(self, row: RequestRow, cut: SliceCut, places: Sequence[tuple[str, str]]) -> None:
-        size = self._spool.requests.set_cut(row.id, [each.id for each in cut.slices], places)
+    def _serve(self, row: RequestRow, size: int) -> None:
         self._served[row.requester] += size / (10 - row.priority)
-
-    def _send_whole(self, row: RequestRow, cut: SliceCut, error: Exception) -> None:
-        log.warning('%d slices are sent whole, since they cannot be cut: %s', len(cut.slices), error)
-        self._spool.requests.set_complete(row.id, [each.id for each in cut.slices])
 
     def _next(self, rows: Sequence[RequestRow]) -> RequestRow | None:
         """The most important, oldest request of the requester who was served the fewest bytes, weighted by priority."""

@@ -66,17 +66,17 @@ class Spool:
 
     def __init__(self, root: Path, settings: SpoolSettings, clock: Clock, robot: str, keep: KeepSettings = KEEP) -> None:
         self.root = root
+        self.robot = robot
         self.accounts = Accounts()
         self.recovery = Recovery()
+        self.shortage = Shortage(root)
         self._settings = settings
         self._keep = keep
         self._clock = clock
-        self._robot = robot
         self._tree = Tree(root)
         self._connections = Connections(root)
         self._session: Session | None = None
         self._forgot_ns = 0
-        self._shortage = Shortage(root)
         self._ballast = Ballast(root / 'ballast')
         self.requests = Requests(self._connections, self._tree, robot)
         self.kept = KeptObjects(self._connections, self._tree, self._ballast, settings, keep, clock)
@@ -193,11 +193,6 @@ class Spool:
         """Whether the key is taken. Waits for no commit; raises sqlite3.Error."""
         return self._connections.reading.objects.has(bucket, key)
 
-    @property
-    def evicted(self) -> int:
-        """Objects that this process evicted because the disk or the spool was full."""
-        return self._shortage.evicted
-
     def states(self, bucket: str, prefix: str) -> dict[str, State]:
         """The states of all objects whose keys start with ``prefix``, by key. Waits for no commit; raises sqlite3.Error."""
         return {row['key']: State(row['state']) for row in self._connections.reading.objects.with_prefix(bucket, prefix)}
@@ -211,27 +206,13 @@ class Spool:
         with self._connections.snapshot() as index:
             return index.gaps.changed(version, limit, offsets), index.gaps.watermarks()
 
-    @property
-    def unkept(self) -> int:
-        """Objects that this process could not keep, because no kept object may be evicted."""
-        return self._shortage.unkept
-
-    @property
-    def owner(self) -> str:
-        """The robot whose sessions and recordings this spool continues."""
-        return self._robot
-
     def recordings(self) -> list[RecordingRows]:
         """Bags of this robot that are not complete yet. Waits for no commit; raises sqlite3.Error."""
-        return self._connections.reading.recordings.rows(self._robot)
-
-    def free_bytes(self) -> int:
-        """Bytes that this user may still write to the spool's file system. Raises OSError."""
-        return self._tree.free_bytes()
+        return self._connections.reading.recordings.rows(self.robot)
 
     def has_room(self) -> bool:
         """Whether a bag may continue: enough space must be left to spool what it has already written."""
-        return self.free_bytes() >= self._settings.min_free_bytes // 2
+        return self._tree.free_bytes() >= self._settings.min_free_bytes // 2
 
     def carry(self, sink: str) -> None:
         """Take over the messages of a sink that this robot's earlier sessions left open. Call it once, before the sink counts."""
@@ -239,7 +220,7 @@ class Spool:
             if self._session is not None:
                 index = self._connections.writing
                 with index.transaction():
-                    rows = carry(index, self._session.number, self._robot, sink)
+                    rows = carry(index, self._session.number, self.robot, sink)
                 self.accounts.carried.take_over(rows)
 
     def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
@@ -275,7 +256,7 @@ class Spool:
     @contextmanager
     def node_lock(self) -> Iterator[bool]:
         """The lock of the one node that takes this robot's messages; a second one would count and store them again."""
-        with flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
+        with flock(self.root / f'node-{self.robot}.lock', wait=False) as mine:
             yield mine
 
     def _end(self, session: Session) -> None:
@@ -293,9 +274,9 @@ class Spool:
             with flock(self.root / 'recovery.lock'):
                 self._connections.writing = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._connections.reading.open()
-                self._session = Session.begin(self._connections.writing, self.root, self._robot, self._clock)
+                self._session = Session.begin(self._connections.writing, self.root, self.robot, self._clock)
                 self._connections.session = self._session.number
-                self.accounts = _continued(self._connections.writing, self._robot, self._clock)
+                self.accounts = _continued(self._connections.writing, self.robot, self._clock)
         except (OSError, sqlite3.Error):
             self._connections.writing.close()
             self._connections.reading.close()
@@ -312,7 +293,7 @@ class Spool:
         now_ns = self._clock.wall_ns()
         leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
         room = make_room(self._connections.writing, self._tree, self._settings, self._keep, objects, leaving, now_ns)
-        self._shortage.note(room, now_ns)
+        self.shortage.note(room, now_ns)
         stored = _count(objects)
         snapshot = self.accounts.snapshot(stored)
         session = self._connections.session
@@ -326,7 +307,7 @@ class Spool:
                     for outcome in outcomes:
                         self._connections.writing.states.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                     for each in rows:
-                        self._connections.writing.recordings.write(self._robot, each)
+                        self._connections.writing.recordings.write(self.robot, each)
                     if snapshot is not None and self._session is not None:
                         self._connections.writing.accounts.write(self._session.number, snapshot)
                     self._tidy(now_ns)

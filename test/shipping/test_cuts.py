@@ -91,7 +91,7 @@ def stored(desk: Desk, bag: str, folder: Path) -> list[Recorded]:
 def test_a_range_within_a_slice_arrives_as_a_bag_of_its_own(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has the messages of that time, byte for byte, and about their bytes; the slice stays, and the ledger closes."""
     request, since_ns, until_ns = asked(desk, 12, 14)
-    monkeypatch.setattr('shadowhound_data_logger.shipping.requests.CUT_S', 0.0)
+    monkeypatch.setattr('shadowhound_data_logger.shipping.slice_cuts.CUT_S', 0.0)
     desk.step()
     monkeypatch.undo()
     first = desk.answers(request)[0]
@@ -142,7 +142,7 @@ def test_the_same_range_is_cut_and_sent_once(desk: Desk) -> None:
 def test_a_death_while_it_is_cut_leaves_one_cut(desk: Desk, tmp_path: Path) -> None:
     """Whether it died before the spool had the cut, or before the request knew of it."""
     request, since_ns, until_ns = asked(desk, 12, 14)
-    desk.server._cut = lambda _: False  # type: ignore[method-assign] # it dies before any work is done
+    desk.server._cuts.work = lambda _: False  # type: ignore[method-assign] # it dies before any work is done
     desk.step()
     desk.spool.close()
     desk.open()
@@ -180,7 +180,7 @@ def test_a_slice_that_cannot_be_cut_is_sent_whole(desk: Desk, damage: str) -> No
 def test_a_request_that_is_taken_back_ends_its_cut(desk: Desk) -> None:
     """Nothing of it is sent, and nothing stays on the disk."""
     ticks = itertools.count()
-    desk.server._monotonic = lambda: next(ticks) * 0.03  # a chunk at each step
+    desk.server._monotonic = desk.server._cuts._monotonic = lambda: next(ticks) * 0.03  # a chunk at each step
     request, *_ = asked(desk, 12, 14)
     desk.step()
     desk.step()

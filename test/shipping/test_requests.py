@@ -127,7 +127,7 @@ def test_protected_alone_beyond_the_limit_ends_keeping(tmp_path: Path) -> None:
         desk.keeps(*(frame(number, body=bytes([number]) * (300 << 10), protected=True) for number in range(4)))
         desk.keeps(frame(9, body=b'9' * 100_000))
         assert [desk.state(number) for number in (0, 1, 2, 3, 9)] == ['kept'] * 4 + ['evicted']
-        assert desk.spool.unkept == 1
+        assert desk.spool.shortage.unkept == 1
         assert_whole(desk.root)
 
 
