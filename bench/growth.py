@@ -1,7 +1,8 @@
 """How CPU, memory and loss of the node grow with the number of topics, the rate of images, and the rate of a bag.
 
-Topics: Imu at 10 Hz on each, all stored, in an object per topic and second. Images: one camera, received at 1 to 30 MB/s and stored
-once a second, as by default. Bags: the same camera recorded completely. A SeaweedFS server and the publisher share the machine.
+Topics: Imu at 10 Hz on each, all stored, in an object per topic and second. Images: one camera, received at 1 to 30 MB/s and
+stored once a second, as by default. Bags: the same camera recorded completely. A SeaweedFS server and the publisher share the
+machine.
 """
 
 from __future__ import annotations

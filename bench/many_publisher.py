@@ -1,8 +1,8 @@
 """Publishes on many topics, or large images on one, at a steady rate, as ``bench/growth.py`` orders it.
 
 Each line of standard input is an order, each is answered with a line of JSON: ``{"subscribers": 1}`` waits until every topic has
-so many, ``{"seconds": 10, "rate_hz": 30}`` publishes on every topic. Messages are serialized once; only the stamp of the header is
-changed, to the time of its publication. RELIABLE, as most drivers publish.
+so many, ``{"seconds": 10, "rate_hz": 30}`` publishes on every topic. Messages are serialized once; only the stamp in the header
+is changed, to the time of publication. RELIABLE, as most drivers publish.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import random
 import signal
+import struct
 import sys
 import time
 from collections import Counter
@@ -20,13 +21,14 @@ from typing import Any, Final
 from e2e.bag_reading import Bag, bags
 from e2e.processes import Node, Processes, published
 from e2e.reading import TYPES
-from e2e.witness import recorded
+from e2e.witness import Heard, recorded
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._kill_audit import HEADERLESS
 from torture.kills import ROBOT, running
 
 KILLS: Final = 50
@@ -139,16 +141,25 @@ def audit(found: Found, stored: Sequence[Bag], happened: Run, said: dict[str, An
         found.say('the ledger knows all', str(ledger.imbalances(said)))
 
 
+def stamp_of(message: Heard) -> int:
+    """The publish time that a bag has: the stamp of the header, else the time of sending."""
+    if message.topic in HEADERLESS:
+        return message.source_ns
+    sec, nanosec = struct.unpack_from('<iI', message.cdr, 4)
+    return int(sec * SECOND + nanosec)
+
+
 def _compare(found: Found, heard_at: Path, times: dict[str, list[int]], contents: dict[tuple[str, int], bytes]) -> int:
     """What is recorded is what was published, in its order; by how much the witness was late at worst, ns."""
     order: dict[str, list[int]] = {topic: [] for topic in TYPES}
     gap_ns, before = 0, 0
     for message in recorded(heard_at):
-        cdr = contents.get((message.topic, message.source_ns))
+        stamp_ns = stamp_of(message)
+        cdr = contents.get((message.topic, stamp_ns))
         if cdr is not None:
-            order[message.topic].append(message.source_ns)
+            order[message.topic].append(stamp_ns)
             if cdr != message.cdr:
-                found.say('equal bytes in the same order', f'{message.topic} {message.source_ns} differs')
+                found.say('equal bytes in the same order', f'{message.topic} {stamp_ns} differs')
         if message.topic == '/imu':
             gap_ns, before = max(gap_ns, message.source_ns - before if before else 0), message.source_ns
     for topic, recorded_ns in times.items():

@@ -271,7 +271,7 @@ def on_page(processes: Processes, node: Node) -> list[Gap] | None:
         told = page.locator('rect.gap').evaluate_all('gaps => gaps.map(gap => ({...gap.dataset}))')
     return [
         Gap(OBJECTS, gap['topic'], None, None, gap['kind'], gap['cause'], round(float(gap['from']) * 1e6),
-            round(float(gap['to']) * 1e6), int(gap['count']), 1, '', None)
+            round(float(gap['to']) * 1e6), None, None, int(gap['count']), 1, '', None)
         for gap in told
     ]  # fmt: skip
 

@@ -98,7 +98,7 @@ class _Found:
     """The contents, repaired or not."""
     new: Path | None = None
     """The repaired file."""
-    poll: tuple[int, int] = (0, 0)
+    size_and_time: tuple[int, int] = (0, 0)
     """Size and modification time when it was examined."""
 
 
@@ -130,7 +130,7 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
     result = BagRepair(path, None, tuple(each.report for each in found), remarks, absent)
     if not result.is_damaged:
         return result
-    progress.begin(sum(each.poll[0] * (1 + each.report.is_damaged) for each in found))
+    progress.begin(sum(each.size_and_time[0] * (1 + each.report.is_damaged) for each in found))
     with _writing(out, in_place=in_place) as folder:
         for each in found:
             if each.report.is_damaged and not each.report.failed:
@@ -182,8 +182,8 @@ def _repaired_name(path: Path) -> Path:
 
 def _examine(name: str, path: Path, progress: ProgressListener) -> _Found:
     """Find the damage in a file, without writing anything."""
-    poll = _look(path)
-    size, is_open = poll[0], name.endswith(OPEN_SUFFIX)
+    size_and_time = _look(path)
+    size, is_open = size_and_time[0], name.endswith(OPEN_SUFFIX)
     if name.endswith((SQLITE, PACKED)):
         try:
             info = open_bag_file(LocalFile(path)).check()
@@ -200,7 +200,7 @@ def _examine(name: str, path: Path, progress: ProgressListener) -> _Found:
             info = None if report.is_damaged else found.info
         except BagDamaged as error:
             info, report = None, FileRepair(name, size, None, lost_messages=None, failed=error.what)
-    return _Found(name, path, name.removesuffix(OPEN_SUFFIX), report, info, poll=poll)
+    return _Found(name, path, name.removesuffix(OPEN_SUFFIX), report, info, size_and_time=size_and_time)
 
 
 def _look(path: Path) -> tuple[int, int]:
@@ -211,7 +211,7 @@ def _look(path: Path) -> tuple[int, int]:
 def _check_unchanged(found: Sequence[_Found]) -> None:
     """Raises BagError if a file changed since it was examined, because a recorder still writes it."""
     for each in found:
-        if _look(each.path) != each.poll:
+        if _look(each.path) != each.size_and_time:
             for other in found:
                 if other.new is not None:
                     other.new.unlink(missing_ok=True)

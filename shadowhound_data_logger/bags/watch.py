@@ -67,7 +67,7 @@ class BagMark:
 
     state: str
     """SPOOLED, STORED or REMOVED; the fields with these names have the times."""
-    poll: tuple[FoundFile, ...]
+    listing: tuple[FoundFile, ...]
     files: tuple[SentFile, ...]
     spooled: str
     stored: str | None = None
@@ -204,7 +204,7 @@ class Watch:
 
     def _remove(self, path: Path, mark: BagMark) -> bool:
         """Delete a bag if the store confirms it now and it has not changed since it was uploaded."""
-        if _list_files(path) != mark.poll or not self._is_stored(mark):
+        if _list_files(path) != mark.listing or not self._is_stored(mark):
             return False
         shutil.rmtree(path)
         mark.state, mark.removed = REMOVED, iso(self._clock.wall_ns())

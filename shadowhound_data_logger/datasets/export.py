@@ -98,8 +98,8 @@ def export(  # noqa: PLR0913 - the flags of the command
             waited_s, before = 0.0, dict[str, str]()
             while True:
                 missions = _new(made, planning.chosen(source, flags, findings))
-                with TemporaryDirectory(prefix='shadowhound-plan-') as poll:
-                    plans = list(planning.planned(source, store, missions, options, action, Path(poll), findings))
+                with TemporaryDirectory(prefix='shadowhound-plan-') as scratch:
+                    plans = list(planning.planned(source, store, missions, options, action, Path(scratch), findings))
                 late = [each for each in plans if each.waits_for]
                 now = {each.mission.mission_id: each.waits_for for each in late}
                 waited_s, before = waited_s + LOOK_S if now == before else 0.0, now

@@ -72,7 +72,7 @@ def make(
 
 
 def guess(environ: Mapping[str, str], spool: Path, root: Path) -> Role:
-    """A machine with a spool is Thor, one whose S3 or MLflow port is open is Tower; otherwise Thor if it has ROS, else Spark."""
+    """A robot has a spool, a server an open port of S3 or MLflow; otherwise ROS makes it a robot, and all else a workstation."""
     has_ros = bool(environ.get('ROS_DISTRO')) or find_spec('rclpy') is not None
     if has_ros and (spool / 'index.db').exists():
         return Role.ROBOT

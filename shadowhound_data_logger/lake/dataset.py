@@ -107,7 +107,7 @@ class MissionDataset:
         try:
             return [samples.sample(*each) for each in wanted]
         finally:
-            prefetch.settle(objects)
+            prefetch.discard(objects)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, '_reading': None}
@@ -170,7 +170,7 @@ class MissionDataset:
                 reference, objects = waiting.popleft()
                 sample = samples.sample(*self._location(reference))
                 if not waiting or waiting[0][0][:2] != reference[:2]:
-                    prefetch.settle(objects)
+                    prefetch.discard(objects)
                 if not self._drop_incomplete or is_complete(sample, self.aligned):
                     yield sample
 

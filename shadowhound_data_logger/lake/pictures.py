@@ -99,10 +99,10 @@ def ground(
             axes.plot([], [], c=plots.AMBER, lw=1.6, ls='--', label='selected')
         charge = [float('nan') if row.get('battery_pct') is None else row['battery_pct'] for row in placed]
         is_known = any(value == value for value in charge)  # noqa: PLR0124 - not all are NaN
-        poll = {'c': charge, 'cmap': 'viridis', 'plotnonfinite': True} if is_known else {'c': plots.BLUE}
+        style = {'c': charge, 'cmap': 'viridis', 'plotnonfinite': True} if is_known else {'c': plots.BLUE}
         xs, ys = [row['x'] for row in placed], [row['y'] for row in placed]
         size = max(8.0, min(DOTS, 6000 / len(placed)))
-        dots = axes.scatter(xs, ys, s=size, ec='white', lw=0.5, label='found', zorder=3, **poll)
+        dots = axes.scatter(xs, ys, s=size, ec='white', lw=0.5, label='found', zorder=3, **style)
         axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal')
         axes.set_title('\n'.join(textwrap.wrap(f'{title}: {len(placed):,}' if title else f'{len(placed):,} objects', LETTERS)))
         axes.margins(0.08)

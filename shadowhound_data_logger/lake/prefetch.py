@@ -79,7 +79,6 @@ class Prefetch:
         self._held_bytes = 0
         self.waiting_bytes = 0
         """Bytes of objects that were prefetched and not returned yet."""
-        self._over = threading.Event()
 
     def __enter__(self) -> Self:
         return self
@@ -89,14 +88,13 @@ class Prefetch:
 
     def close(self) -> None:
         """Wait for running requests; idempotent."""
-        self._over.set()
         pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown(cancel_futures=True)
         self._waiting.clear()
 
     def ahead(self, objects: Iterable[Object]) -> None:
-        """Start fetching these; call ``settle`` when they are no longer needed."""
+        """Start fetching these; call ``discard`` when they are no longer needed."""
         for each in objects:
             name = (each.bucket, each.key)
             if name not in self._kept and name not in self._waiting:
@@ -115,7 +113,7 @@ class Prefetch:
         self._keep(name, body)
         return body
 
-    def settle(self, objects: Iterable[Object]) -> None:
+    def discard(self, objects: Iterable[Object]) -> None:
         """Discard those of these that were fetched but not used."""
         for each in objects:
             waiting = self._waiting.pop((each.bucket, each.key), None)

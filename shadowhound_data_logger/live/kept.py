@@ -62,7 +62,7 @@ class KeptSource(Protocol):
     """Whether kept objects are included in the recorded runs (``live/past.py``)."""
 
     def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
-        """Objects that are kept or lost, with the part in this time: columns of ``catalog.schema.KEPT``."""
+        """Objects that are kept or lost, with the part in this time: columns of ``formats.rows.schema.KEPT``."""
 
     def mbps(self, robot: str) -> float | None:
         """The robot's upload throughput; None if unknown."""

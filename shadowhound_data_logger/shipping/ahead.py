@@ -89,7 +89,7 @@ class Ahead:
 
     def end_look(self, important: Sequence[SpooledObject], oldest: Sequence[SpooledObject], *,
                  taken: Collection[int], without: Collection[str]) -> None:  # fmt: skip
-        """Replace what is here, but for what is ``taken``, of a bucket ``without``, or was settled while the look read it."""
+        """Replace both queues; skip ids in ``taken``, buckets in ``without``, and what was settled during the lookup."""
         late, self._settled_meanwhile, self._looking = self._settled_meanwhile, set(), False
         self._more = len(important) >= IMPORTANT
         gone = late.union(taken)

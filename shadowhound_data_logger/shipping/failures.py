@@ -1,7 +1,7 @@
 """What a failed put means, in one table: what caused it, and when the object, its bucket or the store is tried again.
 
-A store, or one bucket of it, that takes nothing for a while is an Outage, with one probe at a time; an object that fails alone
-waits for its own next try.
+A store or bucket that rejects everything is an Outage, with one probe at a time. An object that fails alone waits in the
+RetryQueue.
 """
 
 from __future__ import annotations
@@ -159,8 +159,8 @@ class Breakers:
     def without(self, now: float) -> tuple[str, ...]:
         return tuple(bucket for bucket in self.buckets if not self.lets(bucket, now))
 
-    def open_since(self, now: float) -> list[float]:
-        """Since when probes may go, of each outage that waits for one."""
+    def probe_times(self, now: float) -> list[float]:
+        """When the probes of outages became due that have not been sent."""
         return [outage.retry_at for outage in self if outage.may_probe(now)]
 
     def claim(self, item: SpooledObject) -> None:
@@ -219,7 +219,7 @@ class _Failure:
     delivered_to_bucket: int
 
 
-class History:
+class RetryQueue:
     """Deliveries, and the objects that wait for their own next try. Guarded by the lock of the Schedule it belongs to.
 
     An object stays in it while it is tried again, until it is forgotten.

@@ -16,7 +16,7 @@ from typing import Final
 from shadowhound_data_logger.core.errors import StoreError
 from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.shipping.ahead import LOOK_EVERY_S, Ahead
-from shadowhound_data_logger.shipping.failures import Breakers, History, Notice, Verdict, decide, quarantine_reason
+from shadowhound_data_logger.shipping.failures import Breakers, Notice, RetryQueue, Verdict, decide, quarantine_reason
 
 MANY_DEFERRED: Final = 64
 """From here on most probes are objects that failed before: a long outage does not touch ever more objects."""
@@ -101,7 +101,7 @@ class Schedule:
         self._waiting_for: frozenset[str] = frozenset()
         self._ahead = Ahead()
         self._breakers = Breakers(backoff_s, rng)
-        self._history = History(backoff_s, rng)
+        self._history = RetryQueue(backoff_s, rng)
         self._in_flight: dict[int, tuple[SpooledObject, int]] = {}  # by id; deliveries when it was claimed
         self._unsettled: set[int] = set()
         self._retries = 0
@@ -118,7 +118,7 @@ class Schedule:
             store = self._breakers.store
             if not self._active or (store and not store.may_probe(now)):
                 return self._rest(now)
-            if self._ahead.wants_look(now, self._breakers.open_since(now)):
+            if self._ahead.wants_look(now, self._breakers.probe_times(now)):
                 self._ahead.begin_look(now)
                 return Look(self._taken(), self._breakers.without(now), self._waiting_for)
             item = self._claim(now)

@@ -1,7 +1,7 @@
 """Sends spooled objects to the store: threads that do what the Schedule decides.
 
-An object leaves the spool only after the store confirmed it, or with the reason why it never will. What is logged is the
-beginning and the end of an outage, never its every object.
+An object leaves the spool after the store has confirmed it, or with the reason why it never will. The log has the beginning and
+the end of an outage, not each of its objects.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ class Uploader:
     def drain(self, deadline_s: float) -> bool:
         """Wait until nothing is pending and every outcome is durable; whether that is so.
 
-        False after ``deadline_s`` seconds, and at once where waiting is no use: the store is away, the credentials are
-        refused, all that is left belongs to buckets that take nothing or waits for a rule, or another process drains.
+        False after ``deadline_s`` seconds, and immediately if waiting is pointless: the store is unreachable, the credentials are
+        rejected, the rest belongs to buckets that are unavailable or waits for a rule, or another process drains.
         """
         self._schedule.wake()
         end = self._monotonic() + deadline_s
@@ -189,9 +189,9 @@ class Uploader:
         if isinstance(step, Rest):
             self._schedule.rest(step)
         elif isinstance(step, Look):
-            poll = partial(self._spool.pending, exclude=step.exclude, without=step.without, waiting_for=step.waiting_for)
-            important = poll(IMPORTANT)
-            oldest = poll(OLDEST, oldest=True) if len(important) == IMPORTANT else important
+            pending = partial(self._spool.pending, exclude=step.exclude, without=step.without, waiting_for=step.waiting_for)
+            important = pending(IMPORTANT)
+            oldest = pending(OLDEST, oldest=True) if len(important) == IMPORTANT else important
             self._schedule.found(important, sorted(oldest, key=lambda item: item.id)[:OLDEST])
         else:
             self._ship(step.item)

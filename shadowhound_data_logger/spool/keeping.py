@@ -1,4 +1,4 @@
-"""Objects that are kept on the robot until they are requested: released, thinned, and evicted last."""
+"""Objects that are kept on the robot until they are requested: released, thinned, and evicted before the others."""
 
 from __future__ import annotations
 

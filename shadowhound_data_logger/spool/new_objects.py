@@ -115,7 +115,7 @@ class NewObjects:
     def stage(self, objects: Sequence[DataObject], not_stored: Collection[int]) -> list[DataObject]:
         """The objects with their content in durable files next to the parts.
 
-        Skips those with indexes in ``not_stored``, and those that poll like repeats. Raises OSError; then ``close`` cleans up.
+        Skips those with indexes in ``not_stored``, and those that look like repeats. Raises OSError; then ``close`` cleans up.
         """
         expected = self._repeats.expected(objects)
         taken = [

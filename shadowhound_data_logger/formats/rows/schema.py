@@ -212,7 +212,7 @@ def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mappin
 
 
 def place_of(row: Mapping[str, Any]) -> dict[str, str]:
-    """Where the robot was, as the metadata of the object have it; without what is unknown."""
+    """Where the robot was, in the form of an object's metadata, to compare places: without its yaw and its height."""
     found = {}
     if row['x'] is not None and row['y'] is not None:
         found[meta.POSE] = f'{row["x"]} {row["y"]} 0 odom'

@@ -51,7 +51,7 @@ class BatchQueue:
         self._ready = threading.Condition(self._lock)
         self._left = threading.Condition(self._lock)
         self._unfinished: dict[int, tuple[int, Batch]] = {}  # id of a batch -> its sequence number
-        self._put = self._finished = 0
+        self._put_count = self._done_count = 0
         self._lanes: dict[int, deque[Batch]] = {}
         self._messages = 0
         self._bytes = 0
@@ -68,8 +68,8 @@ class BatchQueue:
                 self._lanes[priority] = lane = deque()
                 self._lanes = dict(sorted(self._lanes.items()))
             lane.append(batch)
-            self._put += 1
-            self._unfinished[id(batch)] = self._put, batch
+            self._put_count += 1
+            self._unfinished[id(batch)] = self._put_count, batch
             self._messages += len(batch.samples)
             self._bytes += batch.size
             while self._messages > self._max_messages or self._bytes > self._max_bytes:
@@ -91,13 +91,13 @@ class BatchQueue:
     def done(self, batch: Batch) -> None:
         """A batch from ``get`` has been passed on, or rejected."""
         with self._lock:
-            self._finished += 1
+            self._done_count += 1
             self._finish(batch)
 
     def finished(self, deadline_s: float) -> bool:
         """Whether every batch that was put before this call is done, or dropped, before the deadline."""
         with self._lock:
-            last = self._put
+            last = self._put_count
             return self._left.wait_for(lambda: self._first() > last, max(0.0, deadline_s))
 
     def is_busy(self) -> bool:
@@ -127,11 +127,11 @@ class BatchQueue:
     def status(self) -> QueueStatus:
         with self._lock:
             batches = sum(len(lane) for lane in self._lanes.values())
-            return QueueStatus(batches, self._messages, self._bytes, self._finished, self._max_messages, self._max_bytes)
+            return QueueStatus(batches, self._messages, self._bytes, self._done_count, self._max_messages, self._max_bytes)
 
     def _first(self) -> int:
         """The sequence number of the oldest batch that is not done, or of the next one."""
-        return next((number for number, _ in self._unfinished.values()), self._put + 1)
+        return next((number for number, _ in self._unfinished.values()), self._put_count + 1)
 
     def _remove(self, lane: deque[Batch]) -> Batch:
         batch = lane.popleft()
@@ -147,7 +147,7 @@ class BatchQueue:
 class EncodePool:
     """The threads that encode batches and pass the objects to the spool.
 
-    New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake.
+    New; open once; close once. Owns its threads; ``SpoolWriter.put`` may block them (a slow disk), never the intake.
     """
 
     def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbor

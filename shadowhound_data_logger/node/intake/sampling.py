@@ -119,7 +119,7 @@ class Batcher:
         self._type = type_name
         self._window_ns = round(sensor.batch_s * 1e9)
         self._batch_s = sensor.batch_s
-        self._max_bytes = MAX_BATCH_MESSAGES if sensor.batch_s else 1
+        self._max_messages = MAX_BATCH_MESSAGES if sensor.batch_s else 1
         self.max_bytes = MAX_ARCHIVE_BYTES if sensor.format in ARCHIVES else MAX_BATCH_BYTES
         self._samples: list[Sample] = []
         self.size = 0
@@ -138,7 +138,7 @@ class Batcher:
             self._opened_s = now_s
         self._samples.append(sample)
         self.size += len(sample.cdr)
-        if len(self._samples) == self._max_bytes or self.size >= self.max_bytes:
+        if len(self._samples) == self._max_messages or self.size >= self.max_bytes:
             closed.append(self.close())
         return closed
 
