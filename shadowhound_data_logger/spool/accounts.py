@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 from shadowhound_data_logger.core.clock import Clock
@@ -19,26 +20,6 @@ from shadowhound_data_logger.spool.estimator import TopicEstimate
 from shadowhound_data_logger.spool.gaps import ESTIMATED, TopicGaps, latest
 from shadowhound_data_logger.spool.span import NumberRun, Span
 from shadowhound_data_logger.spool.topic_account import MAX_PUBLISHERS, SINKS, TopicAccount
-
-
-class _Entry:
-    """``Accounts.entry``: a generator would cost five times as much, for every drain of every topic."""
-
-    __slots__ = ('_changed', '_lock', '_topic')
-
-    def __init__(self, lock: threading.Lock, changed: Callable[[str], TopicAccount], topic: str) -> None:
-        self._lock, self._changed, self._topic = lock, changed, topic
-
-    def __enter__(self) -> TopicAccount:
-        self._lock.acquire()
-        try:
-            return self._changed(self._topic)
-        except BaseException:
-            self._lock.release()
-            raise
-
-    def __exit__(self, *_: object) -> None:
-        self._lock.release()
 
 
 class Accounts:
@@ -79,13 +60,12 @@ class Accounts:
             if len(spans) >= MAX_PUBLISHERS:
                 del spans[next(iter(spans))]
 
-    def entry(self, topic: str) -> _Entry:
-        """The topic's account, under the lock: keep it short. The returned context manager may be entered many times."""
-        return _Entry(self._lock, self._changed, topic)
-
-    def _changed(self, topic: str) -> TopicAccount:
-        self._dirty = True
-        return self._account(topic)
+    @contextmanager
+    def entry(self, topic: str) -> Iterator[TopicAccount]:
+        """The topic's account, under the lock: keep it short."""
+        with self._lock:
+            self._dirty = True
+            yield self._account(topic)
 
     def reject(self, topic: str, reasons: Mapping[str, int], first: Times = NO_TIMES, last: Times = NO_TIMES) -> None:
         """Count messages as rejected, by reason; ``first`` and ``last`` are the times of the batch that they were in."""

@@ -1,7 +1,7 @@
 """Rounds over everything that reads what robots write: each makes an input of a seed, and reads it as Spark and Tower do.
 
 What a reader may do with it is answer, or raise an error of ours; what it may write lies in the folder that it was told. Used by
-test_rounds.py and by ``python -m torture.fuzz --readers``.
+``python -m torture.fuzz --readers``.
 """
 
 from __future__ import annotations

@@ -93,12 +93,11 @@ def test_history_taken_before_a_restart_is_not_taken_again() -> None:
 
 
 def test_an_entry_holds_the_lock_as_long_as_it_is_entered() -> None:
-    """It may be entered again, also after an error in it; what was changed meanwhile is in the next snapshot."""
+    """Also until an error in it; what was changed meanwhile is in the next snapshot."""
     accounts = Accounts()
-    entry = accounts.entry('/map')
-    with pytest.raises(ZeroDivisionError), entry as account:
+    with pytest.raises(ZeroDivisionError), accounts.entry('/map') as account:
         account.received += 1 // 0
-    with entry as account:
+    with accounts.entry('/map') as account:
         account.received += 1
         held = threading.Thread(target=accounts.drop, args=('/map', 'queue_full', 1))
         held.start()

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import random
-import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from profiles import examples
-from spool import editing, rotting
 from spool.conftest import Open
 from spool.making import index_of, make, put, settle
 
 from shadowhound_data_logger.core.model import State
-
-ROUNDS = examples(40)
 
 
 @pytest.fixture
@@ -67,17 +61,3 @@ def test_totals_of_other_objects_are_told(index: Path, opened: Open, caplog: pyt
         assert len(list(wrong.miscounted())) == 2
     assert opened().recovery.counts['sums of the ledger that do not balance'] == 2
     assert '/other: pending None, but in the spool (1, 7, 1)' in caplog.text
-
-
-@pytest.mark.sampled
-@pytest.mark.long('which a campaign repeats')
-def test_random_edits(tmp_path: Path) -> None:
-    """Whatever is changed in an index, a start works, ships nothing else than what was spooled, and sums close or it is told."""
-    bodies = rotting.new_base(tmp_path / 'base')
-    for seed in range(ROUNDS):
-        done = editing.edit(tmp_path / 'base', tmp_path / 'edited', random.Random(seed))
-        try:
-            editing.check(tmp_path / 'edited', bodies)
-        except Exception as error:
-            raise AssertionError(f'seed {seed}: {done}') from error
-        shutil.rmtree(tmp_path / 'edited')

@@ -198,7 +198,7 @@ class SensorStream:
         self._sensor = sensor.name
         self._topic = topic
         self._type = type_name
-        self._entry = accounts.entry(topic)
+        self._accounts = accounts
         self._consumers = consumers
         self._sensor_consumers = [consumer for consumer in consumers if consumer.wanted_topics is None]
         self._topic_consumers = [consumer for consumer in consumers if consumer.wanted_topics is not None]
@@ -206,7 +206,7 @@ class SensorStream:
         self._arrivals = Arrivals()
         self._counter: CounterField | None = None
         self._is_refuted = False
-        with self._entry as account:
+        with self._accounts.entry(self._topic) as account:
             account.type = type_name
             account.estimate.expect(self._expected(sensor, types))
         for consumer in self._sensor_consumers:
@@ -228,7 +228,7 @@ class SensorStream:
         unnumbered: dict[str, list[int]] = {}
         counter, date = self._counter, self._times.date
         failed: dict[Consumer, Exception] = {}
-        with self._entry as account:
+        with self._accounts.entry(self._topic) as account:
             for message in taken:
                 cdr, source_ns, gid, number, *_ = message
                 publisher = gid or senders.name(number, source_ns)
