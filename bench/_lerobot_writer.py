@@ -1,4 +1,4 @@
-"""Run by lerobot's own Python: writes pictures and numbers of a folder with its own writer, and says how long that took."""
+"""Run by lerobot's Python: writes a folder's images and numbers with its own writer, and reports the duration."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def main(source: Path, target: Path, fps: int, *, streaming: bool) -> None:
     vector = {'dtype': 'float32', 'shape': (state.shape[1],), 'names': [f'n{number}' for number in range(state.shape[1])]}
     picture = {'dtype': 'video', 'shape': (height, width, 3), 'names': ['height', 'width', 'channels']}
     features = {'observation.images.front': picture, 'observation.state': vector, 'action': vector}
-    begun = time.perf_counter()
+    began = time.perf_counter()
     dataset = LeRobotDataset.create('local/bench', fps, features, root=target, streaming_encoding=streaming)
     for path, numbers in zip(files, state, strict=True):
         dataset.add_frame({'observation.images.front': np.asarray(Image.open(path)), 'observation.state': numbers,
                            'action': numbers, 'task': 'walk'})  # fmt: skip
     dataset.save_episode()
     dataset.finalize()
-    print(json.dumps({'seconds': time.perf_counter() - begun}))
+    print(json.dumps({'seconds': time.perf_counter() - began}))
 
 
 if __name__ == '__main__':

@@ -1,7 +1,7 @@
-"""Links to a server, in a network of the benchmark's own, that carry so many bits a second or are long.
+"""Links to a server with a limited rate or a long delay, in a private network namespace.
 
-The former is as the kernel shapes them (tc-htb(8)): a port on which what comes is passed on to the server; a token bucket on the
-loopback device holds all packets to it. The latter is a device of ours (tun), for not every kernel has tc-netem(8).
+The rate is shaped by the kernel (tc-htb(8)): a port that forwards to the server, and a token bucket on the loopback device that
+holds all packets to it. The delay is a tun device of this program, because not every kernel has tc-netem(8).
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 
 BURST: Final = '32kb'
 QUEUE: Final = 100
-"""Packets that wait for the link at most, as in a radio: 0.4 s at 3 Mbit/s."""
+"""Maximum packets queued for the link, as in a radio: 0.4 s at 3 Mbit/s."""
 MTU: Final = 1500
 PIECE_BYTES: Final = 64 << 10
 NEAR, FAR = '10.79.0.1', '10.79.0.2'
-"""Who connects to the latter comes out at the former, and seems to be the latter there."""
+"""A client that connects to the latter arrives at the former, and appears as the latter there."""
 FAR_DEVICE: Final = 'far'
 _TUNSETIFF: Final = 0x400454CA
 _IFF_TUN, _IFF_NO_PI = 0x0001, 0x1000
 _SOURCE, _DESTINATION = slice(12, 16), slice(16, 20)
-"""In the header of IPv4. The two change places: a checksum is the same then."""
+"""Offsets in the IPv4 header. The two addresses are swapped: the checksum stays the same."""
 _INSIDE: Final = 'SHADOWHOUND_BENCH_NETWORK'
 
 
 def in_own_network() -> None:
-    """Start this program again in a network namespace of its own, unless it is in one; exits without the right to make one."""
+    """Restart this program in a private network namespace, unless it is in one; exits without the permission to create one."""
     if not os.environ.get(_INSIDE):
         if not (shutil.which('unshare') and shutil.which('tc')):
             raise SystemExit('unshare(1) and tc(8) are needed')
@@ -51,7 +51,7 @@ def in_own_network() -> None:
 
 
 class ShapedLinks:
-    """Links to one server, each with a rate of its own. ``with``; owns one thread."""
+    """Links to one server, each with its own rate. ``with``; owns one thread."""
 
     def __init__(self, url: str, mbps: list[float]) -> None:
         self._server = urlsplit(url)
@@ -63,7 +63,7 @@ class ShapedLinks:
 
     def __enter__(self) -> Self:
         self._thread.start()
-        _run('tc', 'qdisc', 'add', 'dev', 'lo', 'root', 'handle', '1:', 'htb')  # what has no class is not held back
+        _run('tc', 'qdisc', 'add', 'dev', 'lo', 'root', 'handle', '1:', 'htb')  # unclassified packets are not delayed
         for place, mbps in enumerate(self._mbps, 16):
             port = asyncio.run_coroutine_threadsafe(self._listen(), self._loop).result(10)
             rate, own = f'{mbps}mbit', f'1:{place}'
@@ -114,9 +114,9 @@ class ShapedLinks:
 
 
 class LongWay:
-    """A way from FAR to NEAR and back through which each packet takes ``round_s``, half in each direction; needs root.
+    """A route from FAR to NEAR and back that delays each packet by half of ``round_s`` in each direction; needs root.
 
-    It lasts as long as the process.
+    It exists as long as the process.
     """
 
     def __init__(self, round_s: float) -> None:

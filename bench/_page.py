@@ -1,6 +1,6 @@
-"""Writes what the benchmarks found into docs/evidence/benchmarks.md: tables between its markers, and the pictures.
+"""Writes the results of the benchmarks into docs/evidence/benchmarks.md: tables between its markers, and the plots.
 
-``python bench/_page.py`` does so from docs/evidence/benchmarks.json, without measuring. No figure of the page is typed by hand.
+``python bench/_page.py`` does so from docs/evidence/benchmarks.json, without measuring. No number of the page is typed by hand.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Figures = Mapping[str, Any]
 
 
 def write(results: Figures, template: Path, output: Path) -> None:
-    """The page and its pictures."""
+    """The page and its plots."""
     (output / 'benchmarks.md').write_text(filled(template.read_text(encoding='utf-8'), results), encoding='utf-8')
     _pictures.draw({name: found['figures'] for name, found in results['benches'].items()}, output / 'images')
 
 
 def filled(page: str, results: Figures) -> str:
-    """The page with these figures; a block whose benchmark was not run says so."""
+    """The page with these results; a block whose benchmark was not run is marked as not measured."""
     return _BLOCK.sub(lambda match: f'{match[1]}{_block(match[2], results)}\n{match[3]}', page)
 
 
 def dump(results: Figures) -> str:
-    """JSON with a line a benchmark."""
+    """JSON with one line per benchmark."""
     benches = ',\n'.join(f'{json.dumps(name)}: {json.dumps(found)}' for name, found in results['benches'].items())
     rest = json.dumps({name: value for name, value in results.items() if name != 'benches'})
     return f'{rest[:-1]}, "benches": {{\n{benches}\n}}}}\n'
@@ -70,7 +70,7 @@ def _machine(results: Figures) -> str:
 
 
 def _commands(results: Figures) -> str:
-    """A benchmark that was measured alone, later, has a commit of its own, and maybe another machine."""
+    """A benchmark that was measured separately, later, has its own commit, and maybe another machine."""
     machine = results['machine']
     rows = []
     for found in results['benches'].values():
@@ -190,11 +190,11 @@ def _latency(figures: Figures) -> str:
     words = {'durable': 'durable: the group commit returned', 'confirmed': 'confirmed: the put returned',
              'created_ns': 'index: `created_ns`', 'settled_ns': 'index: `settled_ns`'}  # fmt: skip
     names = ('p50', 'p90', 'p99', 'max')
-    told = [(words[name], row) for name, row in figures['ms'].items()]
+    report = [(words[name], row) for name, row in figures['ms'].items()]
     if leaving := figures.get('leaving'):
         waiting = ', then '.join(f'{count:,}' for count in leaving['waiting'])
-        told.append((f'durable while a backlog leaves ({waiting} objects)', leaving['ms']))
-    return _table(('from the stamp until', *names), [(what, *(f'{row[each]:.0f} ms' for each in names)) for what, row in told])
+        report.append((f'durable while a backlog leaves ({waiting} objects)', leaving['ms']))
+    return _table(('from the stamp until', *names), [(what, *(f'{row[each]:.0f} ms' for each in names)) for what, row in report])
 
 
 def _encode(figures: Figures) -> str:
@@ -239,7 +239,7 @@ def _starts(figures: Figures) -> Iterator[str]:
 
 
 def _ms(found: Figures) -> str:
-    """Median and p99; of what was called once, that."""
+    """Median and p99; a single call has only the former."""
     single = found.get('calls') == 1
     return f'{found["median_ms"]:.2f} ms' if single else f'{found["median_ms"]:.2f} ms, p99 {found["p99_ms"]:.2f} ms'
 
@@ -256,7 +256,7 @@ def _keep(figures: Figures) -> str:
     rows = [(words[name], f'{late["count"]:,}', *(f'{late[each]:.1f} s' for each in ('p50', 'p95', 'max')))
             for name, late in figures['late_s'].items()]  # fmt: skip
     cores, kept, memory = figures['cores'], figures['bytes']['kept'], figures['memory_mb']
-    said = (
+    reported = (
         f'The node that keeps all: {100 * cores["kept"]:.1f} % of a core; the one beside it: {100 * cores["1 Hz"]:.1f} %.'
         f' In {figures["seconds"]:.0f} s {kept["kept"] / 1e6:,.0f} MB were kept and {kept["delivered"] / 1e6:.1f} MB delivered;'
         f' {figures["missed"]:,} messages were missed. The first second of the video was in the store'
@@ -270,7 +270,7 @@ def _keep(figures: Figures) -> str:
     before, after = figures['load']
     load = f'The load average was {before:.1f} at the beginning and {after:.1f} at the end.'
     return '\n\n'.join((
-        _table(('oldest message to the store', 'objects', 'p50', 'p95', 'worst'), rows), said,
+        _table(('oldest message to the store', 'objects', 'p50', 'p95', 'worst'), rows), reported,
         _table(('before the video is asked for', 'first third', 'second', 'last'), parts), load,
     ))  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The pictures of docs/evidence/benchmarks.md, drawn from the figures of the benchmarks alone."""
+"""The plots of docs/evidence/benchmarks.md, drawn only from the results of the benchmarks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Figures = Mapping[str, Any]
 
 
 def draw(figures: Mapping[str, Figures], folder: Path) -> None:
-    """Write the PNG files for which there are figures."""
+    """Write the PNG files that have results."""
     folder.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context(STYLE):
         if 'node_cpu' in figures and 'intake' in figures:
@@ -29,7 +29,7 @@ def draw(figures: Mapping[str, Figures], folder: Path) -> None:
 
 
 def cpu(node_cpu: Figures, intake: Figures, path: Path) -> None:
-    """What the node costs beside the plain node, and its intake beside a callback; whiskers span the rounds."""
+    """CPU of the node next to the plain node, and of its intake next to a callback; whiskers span the rounds."""
     figure = Figure(figsize=(9, 3.8), dpi=DPI, layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
     words = {'guide': "beside the guide's sketch", 'kinder': 'beside the same with\nodometry at 1 Hz'}
@@ -62,7 +62,7 @@ def _bar(axes: Any, place: float, rounds: Sequence[float], color: str, label: st
 
 
 def memory(full_rate: Figures, path: Path) -> None:
-    """Resident memory by kind, and what waits in the spool, over the three phases."""
+    """Resident memory by kind, and the spool's backlog, over the three phases."""
     samples = full_rate['samples']
     times = samples['t']
     figure = Figure(figsize=(9, 4.6), dpi=DPI, layout='constrained')
@@ -85,7 +85,7 @@ def memory(full_rate: Figures, path: Path) -> None:
 
 
 def latency(figures: Figures, path: Path) -> None:
-    """How many of the messages had arrived after how long."""
+    """Cumulative distribution of the messages' delay."""
     curve = figures['curve']
     figure = Figure(figsize=(9, 3.4), dpi=DPI, layout='constrained')
     axes = figure.add_subplot()

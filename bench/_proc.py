@@ -1,4 +1,4 @@
-"""CPU time and memory of processes, read from /proc: a process is measured with all that it started (proc(5))."""
+"""CPU time and memory of processes, read from /proc: each process includes its descendants (proc(5))."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _KINDS: Final = {'RssAnon': 'anon', 'RssFile': 'file', 'RssShmem': 'shmem'}
 class _Stat(NamedTuple):
     parent: int
     ticks: int
-    """utime + stime of the process, and of its children that have ended and were waited for."""
+    """utime + stime of the process, and of its children that have exited and were waited for."""
 
 
 class Memory(NamedTuple):
-    """Resident memory of a process tree, MB (1e6 bytes): ``anon`` is its own, ``file`` and ``shmem`` may be shared."""
+    """Resident memory of a process tree, MB (1e6 bytes): ``anon`` is private, ``file`` and ``shmem`` may be shared."""
 
     anon: float
     file: float
@@ -30,13 +30,13 @@ class Memory(NamedTuple):
 
 
 def cpu_s(pid: int) -> float:
-    """Seconds of CPU, user and system, of a process and all its descendants, ended ones among them."""
+    """CPU seconds, user and system, of a process and all its descendants, including those that exited."""
     stats = _stats()
     return sum(stats[number].ticks for number in _tree(pid, stats)) * TICK_S
 
 
 def threads(pid: int) -> dict[str, float]:
-    """Seconds of CPU of the threads of a process by their names, as ``top -H`` shows these: of all with one name together.
+    """CPU seconds of the threads of a process by name, as shown by ``top -H``; threads of equal name are added.
 
     The main thread, which has the name of the program, is ``main``.
     """
@@ -52,7 +52,7 @@ def threads(pid: int) -> dict[str, float]:
 
 
 def memory(pid: int) -> Memory:
-    """What a process and its descendants have in memory now."""
+    """The current memory of a process and its descendants."""
     total = dict.fromkeys(Memory._fields, 0.0)
     for number in _tree(pid, _stats()):
         try:
@@ -67,12 +67,12 @@ def memory(pid: int) -> Memory:
 
 
 def load() -> float:
-    """Runnable processes, over the last minute: what else goes on on this machine."""
+    """Load average of the last minute: other work on this machine."""
     return os.getloadavg()[0]
 
 
 def busy_s() -> float:
-    """Seconds of CPU that everything on this machine has used since it was started, on all cores together."""
+    """CPU seconds that this machine has used since boot, on all cores."""
     fields = Path('/proc/stat').read_text(encoding='ascii').split('\n', 1)[0].split()[1:]
     user, nice, system, _idle, _iowait, irq, softirq, *_ = (int(field) for field in fields)
     return (user + nice + system + irq + softirq) * TICK_S
@@ -92,7 +92,7 @@ def _stats() -> dict[int, _Stat]:
 
 
 def _tree(pid: int, stats: dict[int, _Stat]) -> list[int]:
-    """The process and its descendants; empty when it is gone."""
+    """The process and its descendants; empty if it has exited."""
     children: dict[int, list[int]] = {}
     for number, stat in stats.items():
         children.setdefault(stat.parent, []).append(number)

@@ -1,4 +1,4 @@
-"""What every benchmark says: figures, and bars with what was measured against each of them."""
+"""The output of every benchmark: results, and bars to compare them with."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from pathlib import Path
 from typing import Any, Final
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / '.cache' / 'bench'
-"""Where spools and servers lie while they are measured, unless another folder is named: on the disk of this checkout."""
+"""Folder of spools and servers, unless another one is given: on the disk of this checkout."""
 LEROBOT: Final = Path(os.environ.get('SHADOWHOUND_LEROBOT', '~/.cache/shadowhound/lerobot/bin/python')).expanduser()
-"""Its own environment's interpreter (docs/development.md), which is not everywhere."""
+"""The interpreter of its separate environment (docs/development.md), which may be missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """Something that must hold. ``rounds`` are the single measurements behind ``value``, for their spread."""
+    """A requirement. ``rounds`` are the single measurements behind ``value``, for their spread."""
 
     what: str
     bar: str
-    """In words, such as ``at most 0.25``."""
+    """As text, such as ``at most 0.25``."""
     value: float | None
     unit: str
     holds: bool
@@ -34,7 +34,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a benchmark found out: plain JSON but for the bars."""
+    """The results of a benchmark: plain JSON except for the bars."""
 
     bars: tuple[Bar, ...]
     figures: dict[str, Any] = field(default_factory=dict)
@@ -45,11 +45,11 @@ class Report:
 
 Measure = Callable[[argparse.Namespace], Report]
 More = Callable[[argparse.ArgumentParser], None]
-"""Adds the arguments of a benchmark's own."""
+"""Adds the arguments of a benchmark."""
 
 
 def main(document: str, measure: Measure, *, seconds: float, more: More = lambda _: None) -> None:
-    """The command line of a benchmark: ``seconds`` is how long it measures unless told otherwise."""
+    """The command line of a benchmark: ``seconds`` is its default duration."""
     parser = argparse.ArgumentParser(description=document.partition('\n')[0])
     parser.add_argument('--seconds', type=float, default=seconds, metavar='S', help=f'how long to measure (default {seconds:g})')
     parser.add_argument('--folder', type=Path, default=FOLDER, help='where the spool lies meanwhile (default .cache/bench)')
@@ -66,12 +66,12 @@ def main(document: str, measure: Measure, *, seconds: float, more: More = lambda
 
 
 def progress(text: str) -> None:
-    """One line on standard error, so that somebody who waits sees what for."""
+    """One line on standard error about the progress."""
     print(f'  {time.strftime("%H:%M:%S")} {text}', file=sys.stderr, flush=True)
 
 
 def show(value: float | None) -> str:
-    """A number as one reads it: three figures that count."""
+    """A number with three significant digits."""
     if value is None:
         return 'unknown'
     if value == 0:
@@ -80,7 +80,7 @@ def show(value: float | None) -> str:
 
 
 def spread(rounds: Sequence[float]) -> str:
-    """Least and greatest of the rounds."""
+    """Minimum and maximum of the rounds."""
     return f'{show(min(rounds))} to {show(max(rounds))}, {len(rounds)} rounds' if len(rounds) > 1 else ''
 
 
@@ -92,11 +92,11 @@ def ratio(ours: Sequence[float], theirs: Sequence[float]) -> tuple[float, tuple[
 
 
 def percentile(values: Sequence[float], percent: float) -> float:
-    """The value that so many percent do not exceed (nearest rank)."""
+    """The value that this percentage does not exceed (nearest rank)."""
     ordered = sorted(values)
     return ordered[max(0, min(len(ordered) - 1, -(-round(percent * len(ordered)) // 100) - 1))]
 
 
 def slope(times: Sequence[float], values: Sequence[float]) -> float:
-    """Of the straight line through the points, least squares."""
+    """Slope of the linear regression through the points."""
     return statistics.linear_regression(times, values).slope

@@ -1,4 +1,4 @@
-"""A world for a measurement: a folder, a ROS domain and an S3 server of its own, and the programs in it; none outlives it."""
+"""The environment of a measurement: a folder, a ROS domain, an S3 server, and programs; all of them stop with it."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ TAIL_LINES: Final = 15
 
 
 class Failed(SystemExit):
-    """The measurement could not be made; the text says why."""
+    """The measurement failed; the text has the reason."""
 
 
 class Program:
-    """A running program. One of this folder is asked line by line on its standard input, and answers with a line of JSON each."""
+    """A running program. Programs of this folder take a request per line on standard input, and answer with a line of JSON."""
 
     def __init__(self, name: str, command: Sequence[str], environ: Mapping[str, str], log: Path) -> None:
         self.name, self.log = name, log
@@ -50,7 +50,7 @@ class Program:
             self._popen = subprocess.Popen(
                 [*command], env=dict(environ), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file,
                 text=True, start_new_session=True,
-                # Safe here: a bench has one thread when it starts its programs, and that one outlives them.
+                # Safe here: a bench has one thread when it starts its programs, and that thread runs until they exit.
                 preexec_fn=self._die_with_the_bench,  # noqa: PLW1509
             )  # fmt: skip
 
@@ -59,16 +59,16 @@ class Program:
         return self._popen.pid
 
     def cpu_s(self) -> float:
-        """Of it and all that it started. Raises Failed when it has ended."""
+        """CPU seconds of it and its descendants. Raises Failed if it has exited."""
         self.check()
         return _proc.cpu_s(self.pid)
 
     def check(self) -> None:
         if self._popen.poll() is not None:
-            raise self.failed(f'ended with exit code {self._popen.returncode}')
+            raise self.failed(f'exited with code {self._popen.returncode}')
 
     def ask(self, **order: object) -> dict[str, Any]:
-        """An order, and the answer to it."""
+        """Send a request; returns the answer."""
         self.check()
         assert self._popen.stdin is not None
         self._popen.stdin.write(json.dumps(order) + '\n')
@@ -81,12 +81,12 @@ class Program:
         text = self._popen.stdout.readline()
         if not text:
             self._popen.wait(STOP_S)
-            raise self.failed(f'said nothing and ended with exit code {self._popen.returncode}')
+            raise self.failed(f'wrote nothing and exited with code {self._popen.returncode}')
         answer: dict[str, Any] = json.loads(text)
         return answer
 
     def stop(self) -> str:
-        """SIGINT, and SIGKILL where that does not help; what it still had to say. Idempotent."""
+        """SIGINT, then SIGKILL if needed; returns its remaining output. Idempotent."""
         if self._popen.poll() is None:
             self._popen.send_signal(signal.SIGINT)
         try:
@@ -94,7 +94,7 @@ class Program:
         except subprocess.TimeoutExpired:
             self._popen.kill()
             self._popen.communicate()
-            raise self.failed(f'did not end within {STOP_S:g} s') from None
+            raise self.failed(f'did not exit within {STOP_S:g} s') from None
         except ValueError:  # its streams are closed: it was stopped before
             return ''
 
@@ -107,9 +107,9 @@ class Program:
 
 
 class World:
-    """``with World(folder) as world:`` everything is below ``folder`` and gone at the end.
+    """``with World(folder) as world:`` everything is below ``folder`` and deleted at the end.
 
-    The folder should lie on the disk that a spool would be on: a memory file system syncs for nothing.
+    The folder should be on the disk that a spool would be on: on a memory file system, syncs cost nothing.
     """
 
     def __init__(self, folder: Path, *, store: bool = True) -> None:
@@ -144,12 +144,12 @@ class World:
         return self.folder / 'home' / 'spool'
 
     def program(self, name: str, *arguments: str, environ: Mapping[str, str] | None = None) -> Program:
-        """A program of this folder, such as ``imu_publisher.py``, or whatever ``-m`` names."""
+        """A program of this folder, such as ``imu_publisher.py``, or one that ``-m`` names."""
         first, *rest = arguments
         return self.command(name, sys.executable, first if first.startswith('-') else str(HERE / first), *rest, environ=environ)
 
     def command(self, name: str, *words: str, environ: Mapping[str, str] | None = None) -> Program:
-        """Any other command, in the environment of this world, with what else ``environ`` has."""
+        """Any other command, in this environment plus ``environ``."""
         log = self.folder / f'{len(self._programs)}-{name}.log'
         program = Program(name, words, {**self._environ, **(environ or {})}, log)
         self._programs.append(program)
@@ -157,7 +157,7 @@ class World:
 
     def node(self, parameters: Mapping[str, Any] | None = None, file: Path | None = None,
              program: Sequence[str] = NODE, environ: Mapping[str, str] | None = None) -> Program:  # fmt: skip
-        """A ``sensor_logger_node``, once it is ready: flat parameters come after the file's, ``environ`` as of ``command``."""
+        """A ``sensor_logger_node``, once it is ready: flat parameters override the file's, ``environ`` as in ``command``."""
         own = self.folder / f'{len(self._programs)}-node.yaml'
         own.write_text(json.dumps({'/**': {'ros__parameters': dict(parameters or {})}}), encoding='utf-8')
         files = [str(path) for path in (file, own) if path is not None]
@@ -167,12 +167,12 @@ class World:
         return node
 
     def sim(self, *parameters: str) -> Program:
-        """A simulated Go2; at its end it says what it published."""
+        """A simulated Go2; when it exits it reports what it published."""
         given = [word for parameter in parameters for word in ('-p', parameter)]
         return self.program('sim_go2_node', *SIM, *(['--ros-args', *given] if given else []))
 
     def ledger(self) -> Mapping[str, Any]:
-        """Of now; empty of topics while there is none."""
+        """The current ledger; without topics while there is none."""
         try:
             return ledger.read(self.spool, ROBOT)
         except SpoolError:
@@ -189,17 +189,17 @@ class World:
 
 
 def lost(rows: Iterable[Mapping[str, Any]]) -> int:
-    """What topics of a ledger missed and dropped. Raises Failed where it is not known what was missed."""
+    """Missed and dropped messages of a ledger's topics. Raises Failed if the missed ones are unknown."""
     total = 0
     for row in rows:
         if row['missed'] is None:
-            raise Failed(f'what was missed of {row["type"]} is not known: {row["accounting"]}')
+            raise Failed(f'the missed messages of {row["type"]} are unknown: {row["accounting"]}')
         total += row['missed'] + sum(row['dropped'].values())
     return total
 
 
 def make_bucket(tower: Tower) -> None:
-    """The node makes its buckets itself; a plain node and bare puts take them for granted."""
+    """The node creates its buckets itself; a plain node and bare puts need them beforehand."""
     settings = tower.store_settings()
     client = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
                           aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
@@ -208,11 +208,11 @@ def make_bucket(tower: Tower) -> None:
 
 
 def until(condition: Callable[[], object], what: str, *programs: Program, seconds: float = START_S) -> None:
-    """Wait for a condition while the programs run; raises Failed when that takes too long."""
+    """Wait for a condition while the programs run; raises Failed if that takes too long."""
     end = time.monotonic() + seconds
     while not condition():
         for program in programs:
             program.check()
         if time.monotonic() > end:
-            raise Failed(f'waited {seconds:g} s in vain for {what}')
+            raise Failed(f'timed out after {seconds:g} s waiting for {what}')
         time.sleep(0.05)

@@ -1,8 +1,9 @@
-"""Ten questions about what was in the data and what was said of it, on the tables of a million rows.
+"""Ten queries about values in the data and about texts, on tables of a million rows.
 
-Run it as ``python bench/ask.py [--objects 1000000] [--missions 100000] [--folder F] [--json]``. The objects are batches of an
-IMU of one second; a few of them hold a bump, and only those lie in the store, a folder: all others are never opened.
-The answers are held against what was generated. Two of the questions are asked as commands, too, with the start of Python.
+Run it as ``python bench/ask.py [--objects 1000000] [--missions 100000] [--folder F] [--json]``. The objects are batches of one
+second of an IMU; a few of them contain a bump, and only those are in the store, a folder: the others are never opened. The
+answers
+are compared with what was generated. Two of the queries are also run as commands, including the startup of Python.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ FIRST_NS: Final = 1_790_812_800 * SECOND
 """2026-10-01T00:00:00Z."""
 DAY: Final = 86_400
 EVERY: Final = 20_000
-"""Of so many objects one holds a bump."""
+"""One of this many objects contains a bump."""
 MESSAGES: Final = 50
 FIELDS: Final = ('accelerometer.0', 'accelerometer.1', 'accelerometer.2', 'temperature')
 VALUE_S, WORDS_S = 1.0, 0.1
@@ -68,14 +69,14 @@ def batch(number: int) -> list[dict[str, Any]]:
 
 
 def fill(settings: StoreSettings, store: ObjectStore, folder: Path, objects: int) -> tuple[int, int]:
-    """The tables of all days, one file of each; bytes of the objects and of the statistics."""
+    """The tables of all days, one file each; returns the bytes of the objects and of the statistics."""
     source = Bucket(settings, BUCKET)
     tables = Tables.for_ingest(source)
     for start in range(0, objects, DAY):
         numbers = np.arange(start, min(start + DAY, objects))
-        rows, told = _rows(numbers), _statistics(store, folder, numbers)
+        rows, report = _rows(numbers), _statistics(store, folder, numbers)
         date = f'{utc(FIRST_NS + start * SECOND):%Y-%m-%d}'
-        for of, made in ((OBJECTS, rows), (STATISTICS, told)):
+        for of, made in ((OBJECTS, rows), (STATISTICS, report)):
             table = TABLES[of.folder]
             dated = made.add_column(0, 'date', pa.array([date] * len(made))).cast(table.schema)
             tables.append(tables.open(table), table, dated)
@@ -115,7 +116,7 @@ def _rows(numbers: np.ndarray[Any, Any]) -> pa.Table:
 
 
 def _statistics(store: ObjectStore, folder: Path, numbers: np.ndarray[Any, Any]) -> pa.Table:
-    """As the encoder tells them for the bumps, which lie in the store; of the others made of the same numbers at once."""
+    """As the encoder writes them for the bumps, which are in the store; for the others generated from the same numbers."""
     from shadowhound_data_logger.core.model import SpooledObject  # noqa: PLC0415
 
     rng = np.random.default_rng(int(numbers[0]))
@@ -155,20 +156,20 @@ def _statistics(store: ObjectStore, folder: Path, numbers: np.ndarray[Any, Any])
 
 
 def words(path: Path, missions: int) -> None:
-    """An index of so many missions, each with an event."""
+    """An index of this many missions, each with an event."""
     rng = random.Random(1)
     with search._opened(path, is_new=True) as db, db:
         for number in range(missions):
             thing, place = rng.choice(THINGS), rng.choice(PLACES)
             begin_ns = FIRST_NS + number * 60 * SECOND
-            kind, said = rng.choice(('patrol', 'explore', 'inspect')), f'look at the {thing} number {number % 977}'
-            told = {
-                'mission_id': f'm{number}', 'mission_type': kind, 'mission_command': f'go to the {place} and {said}',
+            kind, reported = rng.choice(('patrol', 'explore', 'inspect')), f'look at the {thing} number {number % 977}'
+            report = {
+                'mission_id': f'm{number}', 'mission_type': kind, 'mission_command': f'go to the {place} and {reported}',
                 'start_ns': begin_ns, 'end_ns': begin_ns + SECOND, 'success': number % 10 > 0, 'result': 'FINISHED',
                 'errors': [{'error': f'lost sight of {number}'}] * (number % 10 == 0),
                 'events': [{'name': f'{thing}_seen', 'distance_m': round(rng.uniform(0, 5), 2), 'place': place}],
             }  # fmt: skip
-            search.add(db, search.of_mission('thor', f'r{number}', told))
+            search.add(db, search.of_mission('thor', f'r{number}', report))
 
 
 def measure(options: argparse.Namespace) -> Report:
@@ -231,7 +232,7 @@ def words_of(flags: Mapping[str, Any]) -> str:
 
 
 def _command_s(home: Path, *arguments: str) -> list[float]:
-    """Seconds from the start of Python to its end."""
+    """Seconds from the start of Python to its exit."""
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *arguments, '--json']
     environ = {**os.environ, 'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': ''}
     return _timed(lambda: subprocess.run(command, env=environ, check=True, capture_output=True))[0]

@@ -1,12 +1,14 @@
-"""Prints what finding the next object to ship costs with a long backlog, and who is served while one is drained.
+"""Prints the cost of finding the next object to upload with a long backlog, and how a backlog is shared while it drains.
 
 Run it as ``python bench/backlog.py [--long] [--folder F] [--json]``; ``--long`` adds a million rows. Without it, it takes a
 minute.
 
-Claims: the real spool and schedule, no network. A claim is all steps up to the one that names an object: out of what was
-looked up before (``drain``), or with a poll at the spool each time, as when new objects arrive all the time (``poll``), also
-while a bucket that holds all but a few of the objects takes nothing (``blocked``). Shares: eight hours of the default profile
-wait, the profile goes on, and a store takes ten objects a second; the clock is simulated.
+Claims: the real spool and schedule, no network. A claim is all steps until an object is chosen: from a cached list (``drain``),
+or
+with a query of the spool each time, as when new objects keep arriving (``poll``), also while a bucket with almost all objects
+rejects uploads (``blocked``). Shares: eight hours of the default profile wait, the profile continues, and a store accepts ten
+objects
+per second; the clock is simulated.
 """
 
 from __future__ import annotations
@@ -35,20 +37,20 @@ NOON_NS: Final = 1_760_788_800 * SECOND
 ROWS: Final = (1_000, 10_000, 100_000)
 LONG_ROWS: Final = (*ROWS, 1_000_000)
 CLAIMS: Final = 400
-"""Fewer than the shortest backlog holds."""
+"""Fewer than the shortest backlog has."""
 SETTLE_EVERY: Final = 25
 WITH_FILES: Final = 800
-"""Objects of each priority that lie on the disk: more than are ever asked for."""
+"""Objects of each priority with files on the disk: more than are ever requested."""
 THREADS: Final = 4
 OUTAGE_S: Final = 8 * 3600
 WATCHED_S: Final = 600.0
 STORE_PER_S: Final = 10.0
-"""Of objects; the profile makes 6.1."""
+"""Objects per second; the profile produces 6.1."""
 Pending = Callable[..., list[SpooledObject]]
 
 
 def profile() -> dict[str, tuple[int, float]]:
-    """Sensor -> priority and objects a second of the default profile; what is sent on change is left out."""
+    """Sensor -> priority and objects per second of the default profile, without sensors that are sent on change."""
     sensors = [SensorSettings(name=name, **values) for name, values in DEFAULT_SENSORS.items()]
     return {
         sensor.name: (sensor.priority, SECOND / sensor.period_ns) for sensor in sensors if sensor.enabled and not sensor.on_change
@@ -56,7 +58,7 @@ def profile() -> dict[str, tuple[int, float]]:
 
 
 def arrivals(start_s: float, end_s: float) -> Iterator[tuple[float, str, int]]:
-    """(time, sensor, priority) of each object that is made, in order."""
+    """(time, sensor, priority) of each new object, in order."""
 
     def stream(name: str, priority: int, rate: float) -> Iterator[tuple[float, str, int]]:
         return ((number / rate, name, priority) for number in range(round(start_s * rate), round(end_s * rate)))
@@ -65,7 +67,7 @@ def arrivals(start_s: float, end_s: float) -> Iterator[tuple[float, str, int]]:
 
 
 class Drain:
-    """A schedule, and the spool that it asks; what is claimed is delivered at once and settled by the caller."""
+    """A schedule and its spool; a claimed object counts as delivered immediately, and the caller settles it."""
 
     def __init__(self, pending: Pending, monotonic: Callable[[], float]) -> None:
         self._pending = pending
@@ -73,7 +75,7 @@ class Drain:
         self.schedule.activate(True)
 
     def claim(self) -> SpooledObject | None:
-        """The next object, None when there is none."""
+        """The next object, None if there is none."""
         while isinstance(step := self.schedule.step(), Look):
             important = self._pending(IMPORTANT, exclude=step.exclude, without=step.without)
             oldest = self._pending(OLDEST, exclude=step.exclude, oldest=True, without=step.without)
@@ -85,11 +87,11 @@ class Drain:
 
 
 def filled(root: Path, rows: int, bucket: str) -> Spool:
-    """A spool of so many objects of the profile; as many files as are ever looked at."""
+    """A spool with this many objects of the profile; as many files as are ever read."""
     spool = Spool(root, SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), 'thor')
     spool.open()
     lying: dict[int, int] = {}
-    with spool._connections.transaction() as index:  # without the syncing of commits, which is not what is measured here
+    with spool._connections.transaction() as index:  # without syncing commits, which is not measured here
         for number, (_, sensor, priority) in enumerate(itertools.islice(arrivals(0.0, float(rows)), rows)):
             item = make(number, sensor, priority, bucket)
             index.states.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)
@@ -109,7 +111,7 @@ def make(number: int, sensor: str, priority: int, bucket: str = 'sensor-data') -
 
 
 def claims(spool: Spool, *, poll: bool) -> list[float]:
-    """CPU milliseconds of each of some hundred claims; the settling between them is not counted."""
+    """CPU milliseconds of each of some hundred claims, without settling."""
     now = itertools.count()
     drain = Drain(spool.pending, lambda: next(now) * 1e-6)
     spent: list[float] = []
@@ -129,7 +131,7 @@ def claims(spool: Spool, *, poll: bool) -> list[float]:
 
 
 def blocked(spool: Spool) -> list[float]:
-    """CPU milliseconds of looks while the bucket of the backlog takes nothing, each for one object of another bucket."""
+    """CPU milliseconds of polls while the bucket of the backlog rejects uploads, each for one object of another bucket."""
     now = itertools.count()
     drain = Drain(spool.pending, lambda: next(now) * 1e-6)
     item = drain.claim()
@@ -158,7 +160,7 @@ def settle(spool: Spool, schedule: Schedule, done: list[SpooledObject]) -> None:
 
 
 def measured(rows: int, folder: str | None) -> dict[str, float]:
-    """p50 and p99 of each kind of claim, in milliseconds of this thread on a core: what else runs does not count."""
+    """p50 and p99 of each kind of claim, in milliseconds of CPU of this thread: other load does not count."""
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory(dir=folder) as place:
         spool = filled(Path(place, 'spool'), rows, 'sensor-data')
@@ -176,7 +178,7 @@ def measured(rows: int, folder: str | None) -> dict[str, float]:
 
 
 class Waiting:
-    """What waits, in memory: by number, which is the order of time, and by priority."""
+    """The waiting objects, in memory: by number, which is the order of time, and by priority."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -201,7 +203,7 @@ class Waiting:
 
 
 def shares() -> dict[str, Any]:
-    """Who is delivered in the first ten minutes after eight hours, and how long what is new waits for it."""
+    """What is delivered in the first ten minutes after eight hours, and how long new objects wait."""
     waiting, now, sensors = Waiting(), [float(OUTAGE_S)], {}
     for moment, sensor, priority in arrivals(0.0, OUTAGE_S):
         sensors[waiting.add(priority, moment).id] = sensor

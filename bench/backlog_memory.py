@@ -1,9 +1,11 @@
-"""What the node holds in memory while a backlog of bag slices and objects leaves it, above what it holds before.
+"""The node's memory while a backlog of bag slices and objects is uploaded, above its level before.
 
-One node records a bag in slices of ten seconds, keeps a full ring for events and makes forty objects a second, beside a simulated
-robot at its full rate. The S3 server is there (``--seconds``), away (``--away``), and back (``--back``) for longer than a period
-of the catalog, which has a row of each object that leaves. Memory is the resident memory of the node's process tree, a sample a
-second; ``--table`` writes every sample, with what glibc and the queues have of it.
+One node records a bag in slices of ten seconds, keeps a full ring for events and makes forty objects per second, next to a
+simulated
+robot at its full rate. The S3 server is up (``--seconds``), down (``--away``), and up again (``--back``) for longer than a period
+of
+the catalog, which has a row for each delivered object. Memory is the resident memory of the node's process tree, sampled once per
+second; ``--table`` writes every sample, with glibc's and the queues' share.
 """
 
 from __future__ import annotations
@@ -34,10 +36,10 @@ ROLLUP = {'Pss': 'pss', 'Pss_Anon': 'pss_anon', 'Pss_File': 'pss_file', 'Private
 
 
 class Watch:
-    """Samples a node; times are seconds since it was made."""
+    """Samples a node; times are seconds since it was created."""
 
-    def __init__(self, world: World, node: Program, sim: Program, said: Path) -> None:
-        self._world, self._node, self._sim, self._said = world, node, sim, said
+    def __init__(self, world: World, node: Program, sim: Program, reported: Path) -> None:
+        self._world, self._node, self._sim, self._reported = world, node, sim, reported
         self._start = time.monotonic()
         self.rows: list[dict[str, Any]] = []
         """Of each sample: time, phase, CPU seconds until then, and MB."""
@@ -53,11 +55,11 @@ class Watch:
             self.sample(name)
 
     def sample(self, name: str) -> dict[str, Any]:
-        """What it holds now; then a second's rest."""
+        """Take a sample, then wait a second."""
         self._node.check()
         self._sim.check()
         memory = _proc.memory(self._node.pid)
-        bytes_of = {'waiting': self._world.ledger()['bytes'].get('pending', 0), **rollup(self._node.pid), **self._told()}
+        bytes_of = {'waiting': self._world.ledger()['bytes'].get('pending', 0), **rollup(self._node.pid), **self._report()}
         row = {'t': self.t, 'phase': name, 'cpu_s': self._node.cpu_s(), 'resident': memory.resident, **memory._asdict(),
                **{what: size / _proc.MEGA for what, size in bytes_of.items()}}  # fmt: skip
         self.rows.append({what: round(value, 2) if isinstance(value, float) else value for what, value in row.items()})
@@ -68,7 +70,7 @@ class Watch:
         return [row['resident'] for row in self.rows if row['phase'] == phase]
 
     def cores(self, phase: str) -> float:
-        """CPU that it took meanwhile."""
+        """CPU used in a phase."""
         rows = [row for row in self.rows if row['phase'] == phase]
         return float((rows[-1]['cpu_s'] - rows[0]['cpu_s']) / max(rows[-1]['t'] - rows[0]['t'], 1.0))
 
@@ -78,15 +80,15 @@ class Watch:
             writer.writeheader()
             writer.writerows(self.rows)
 
-    def _told(self) -> dict[str, int]:
-        """By the node itself."""
-        lines = self._said.read_text(encoding='utf-8').splitlines()
+    def _report(self) -> dict[str, int]:
+        """The node's own report."""
+        lines = self._reported.read_text(encoding='utf-8').splitlines()
         told: dict[str, int] = json.loads(lines[-1])
         return told
 
 
 def rollup(pid: int) -> dict[str, int]:
-    """Bytes of a process, shared ones in proportion (proc(5), smaps_rollup)."""
+    """Memory of a process, shared memory in proportion (proc(5), smaps_rollup)."""
     found = {}
     for line in Path(f'/proc/{pid}/smaps_rollup').read_text(encoding='ascii').splitlines()[1:]:
         name, _, value = line.partition(':')
@@ -98,11 +100,11 @@ def rollup(pid: int) -> dict[str, int]:
 def measure(options: argparse.Namespace) -> Report:
     with World(options.folder) as world:
         assert world.tower is not None
-        said = world.folder / 'memory.jsonl'
-        node = world.node(PARAMETERS, file=SETTINGS, program=('memory_node.py', str(said)))
+        reported = world.folder / 'memory.jsonl'
+        node = world.node(PARAMETERS, file=SETTINGS, program=('memory_node.py', str(reported)))
         sim = world.sim('image_raw:=false')
-        until(lambda: said.exists() and said.stat().st_size, 'the node to tell of its memory', node, sim)
-        watch = Watch(world, node, sim, said)
+        until(lambda: reported.exists() and reported.stat().st_size, 'the node to tell of its memory', node, sim)
+        watch = Watch(world, node, sim, reported)
         progress('backlog memory: until the ring is full')
         until(lambda: watch.sample('before')['ring'] > 0.95 * RING / _proc.MEGA, 'the ring to be full', node, sim)
         watch.phase('there', options.seconds)

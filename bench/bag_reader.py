@@ -1,8 +1,9 @@
-"""What a message costs to read from a slice of a bag, in microseconds of CPU, beside the readers of `mcap`.
+"""CPU microseconds for reading a message from a slice of a bag, next to the readers of `mcap`.
 
-Run it as ``python bench/bag_reader.py``. All read the same slices in turn, several times over: the profile of a Go2 and 10,000
-small messages a second, from the first message to the last, in the order of the file, checksums held. ``mcap`` follows the index,
-``mcap, record by record`` goes from one end to the other. Memory is the most that was allocated at once.
+Run it as ``python bench/bag_reader.py``. All read the same slices in turn, several times: the profile of a Go2, and 10,000 small
+messages per second, from the first message to the last, in file order, with checksums. ``mcap`` follows the index, ``mcap, record
+by
+record`` reads sequentially. Memory is the peak allocation.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ READERS: dict[str, Callable[[Path], Iterator[int]]] = {'ours': ours, 'mcap': by_
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Every reader once a round, so that what else the machine does falls on all of them."""
+    """Every reader once per round, so that other load affects all of them."""
     options.folder.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(dir=options.folder))
     loads = {'profile': stream(260, 30, options.seconds), 'small': stream(10_000, 0, max(options.seconds / 5, 1))}

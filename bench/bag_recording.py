@@ -1,11 +1,11 @@
-"""What recording costs: CPU of the node while it records the Go2 profile, against its intake alone; and small messages a second.
+"""The cost of recording: CPU of the node while it records the Go2 profile, relative to its intake; and small messages per second.
 
-One node, one simulated robot: rounds without a bag and with one take turns, and next to nothing is stored as objects. The
-bag is not compressed, and no slice ends within a round, so that uploads are not part of it. Then a publisher of serialized
-messages sends 10,000 a second into a bag; the ledger says whether any was lost.
+One node, one simulated robot: rounds with and without a bag alternate, and almost nothing is stored as objects. The bag is not
+compressed, and no slice ends within a round, so that uploads are not included. Then a publisher of serialized messages sends
+10,000 per second into a bag; the ledger shows whether any was lost.
 
-Where ``ros2 bag`` is on the PATH, it records the same stream of small messages as well: each recorder alone, and both at the same
-time. rosbag2 runs with its defaults, in MCAP where it has that.
+If ``ros2 bag`` is on the PATH, it records the same stream of small messages as well: each recorder alone, and both at the same
+time. rosbag2 runs with its defaults, in MCAP if it supports that.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ SETTLE_S = 20.0
 BAR = 1.6
 
 RATES_HZ: Final = (260, 2_000, 10_000)
-"""Beside rosbag2: all that the Go2 profile has together, and small messages."""
+"""Next to rosbag2: the total rate of the Go2 profile, and small messages."""
 OURS: Final = 'node'
 THEIRS: Final = 'rosbag2'
 CASES: Final = {'alone': (OURS,), 'rosbag2 alone': (THEIRS,), 'together': (OURS, THEIRS)}
 PARTS: Final = 3
-"""Of a stream, each measured by itself: their spread is that of a figure."""
+"""Parts of a stream that are measured separately, for the spread."""
 QUIET_S: Final = 2.0
 HELP_S: Final = 60.0
 
 
 def switch(program: Program, what: str) -> None:
-    """Begin or end a bag. Raises Failed."""
+    """Start or stop a bag. Raises Failed."""
     answer = program.ask(do=what)
     if not answer['success']:
         raise Failed(f'~/bag/{what}: {answer["message"]}')
@@ -62,7 +62,7 @@ def received(world: World) -> int:
 
 
 def profile(folder: Path, seconds: float) -> dict[str, Any]:
-    """CPU a message of each round without a bag and with one."""
+    """CPU per message of each round with and without a bag."""
     used: dict[bool, list[float]] = {False: [], True: []}
     with World(folder, store=False) as world:
         node = world.node(PARAMETERS)
@@ -94,7 +94,7 @@ def world_balances(rows: Any) -> bool:
 
 
 def small(folder: Path, seconds: float) -> dict[str, Any]:
-    """10,000 serialized messages a second into a bag."""
+    """10,000 serialized messages per second into a bag."""
     with World(folder, store=False) as world:
         node = world.node(SMALL)
         publisher = world.program('imu_publisher', 'imu_publisher.py', '--topic', TOPIC)
@@ -103,36 +103,36 @@ def small(folder: Path, seconds: float) -> dict[str, Any]:
         publisher.ask(count=SMALL_HZ, rate_hz=SMALL_HZ)
         time.sleep(1.0)
         before = node.cpu_s()
-        told = publisher.ask(count=round(SMALL_HZ * seconds), rate_hz=SMALL_HZ)
-        sent, end = SMALL_HZ + told['published'], time.monotonic() + SETTLE_S
+        report = publisher.ask(count=round(SMALL_HZ * seconds), rate_hz=SMALL_HZ)
+        sent, end = SMALL_HZ + report['published'], time.monotonic() + SETTLE_S
         while world.ledger().get('bags', {}).get(TOPIC, {}).get('received', 0) < sent and time.monotonic() < end:
             time.sleep(0.1)
         used = node.cpu_s() - before
         node.stop()
         row = world.ledger()['bags'][TOPIC]
     return {
-        'published': sent, 'reached_hz': told['published'] / told['seconds'], 'recorded': row['stored'], 'row': row,
-        'node_us': 1e6 * used / told['published'],
+        'published': sent, 'reached_hz': report['published'] / report['seconds'], 'recorded': row['stored'], 'row': row,
+        'node_us': 1e6 * used / report['published'],
     }  # fmt: skip
 
 
 def rosbag2() -> dict[str, Any] | None:
-    """The ``ros2 bag record`` of the PATH: its command without the folder and the topic. None where there is none."""
+    """The ``ros2 bag record`` on the PATH: its command without folder and topic. None if there is none."""
     program = shutil.which('ros2')
     if program is None:
         return None
     command = [program, 'bag', 'record']
-    told = subprocess.run([*command, '--help'], capture_output=True, text=True, timeout=HELP_S, check=False)
-    if told.returncode:
+    report = subprocess.run([*command, '--help'], capture_output=True, text=True, timeout=HELP_S, check=False)
+    if report.returncode:
         return None
-    storage = ['--storage', 'mcap'] if 'mcap' in told.stdout else []
-    topics = ['--topics'] if '--topics' in told.stdout else []
+    storage = ['--storage', 'mcap'] if 'mcap' in report.stdout else []
+    topics = ['--topics'] if '--topics' in report.stdout else []
     return {'record': [*command, *storage], 'topics': topics, 'storage': 'mcap' if storage else 'its default',
             'ros': os.environ.get('ROS_DISTRO', ''), 'version': _version(Path(program))}  # fmt: skip
 
 
 def _version(program: Path) -> str:
-    """What the package.xml beside the program, or in a prefix of the environment, says; empty if it is not there."""
+    """The version in the package.xml next to the program, or in a prefix of the environment; empty if it is not found."""
     prefixes = [str(program.resolve().parents[1]), *os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
     for prefix in prefixes:
         manifest = Path(prefix) / 'share' / 'ros2bag' / 'package.xml'
@@ -142,7 +142,7 @@ def _version(program: Path) -> str:
 
 
 def beside(folder: Path, found: dict[str, Any], seconds: float) -> dict[str, Any]:
-    """CPU a message and what was lost at each rate, by case and by recorder."""
+    """CPU per message and losses at each rate, by case and by recorder."""
     rates: dict[str, Any] = {}
     for rate_hz in RATES_HZ:
         rates[str(rate_hz)] = {}
@@ -171,11 +171,11 @@ def stream(folder: Path, found: dict[str, Any], rate_hz: int, seconds: float, re
         used: dict[str, list[float]] = {name: [] for name in running}
         for _ in range(PARTS):
             before = {name: program.cpu_s() for name, program in running.items()}
-            told = publisher.ask(count=round(rate_hz * seconds / PARTS), rate_hz=rate_hz)
+            report = publisher.ask(count=round(rate_hz * seconds / PARTS), rate_hz=rate_hz)
             for name, program in running.items():
-                used[name].append(1e6 * (program.cpu_s() - before[name]) / told['published'])
-            sent += told['published']
-        time.sleep(QUIET_S)  # for what is on its way
+                used[name].append(1e6 * (program.cpu_s() - before[name]) / report['published'])
+            sent += report['published']
+        time.sleep(QUIET_S)  # for messages in flight
         for program in running.values():
             program.stop()
         stored = {name: world.ledger()['bags'][TOPIC]['stored'] - first if name == OURS else _messages(bag, began_ns)
@@ -184,7 +184,7 @@ def stream(folder: Path, found: dict[str, Any], rate_hz: int, seconds: float, re
 
 
 def _messages(bag: Path, began_ns: int) -> int:
-    """How many messages of a bag of rosbag2 were published since then: it may still be starting when the first ones come."""
+    """Number of messages in a rosbag2 bag that were published since then: it may still be starting when the first ones arrive."""
     try:
         with Reader(bag) as reader:
             stamps = [STAMP.unpack_from(cdr, STAMP_AT) for _, _, cdr in reader.messages()]

@@ -1,4 +1,4 @@
-"""Program of a benchmark: asks the node's services for bags. An order is a line ``{"do": "start"}``, stop or trigger."""
+"""Program of a benchmark: calls the node's bag services. A request is a line ``{"do": "start"}``, stop or trigger."""
 
 from __future__ import annotations
 

@@ -1,9 +1,11 @@
-"""What a message costs to write into a slice of a bag, in microseconds of CPU, beside the writers of `rosbags` and `mcap`.
+"""CPU microseconds for writing a message into a slice of a bag, next to the writers of `rosbags` and `mcap`.
 
-Run it as ``python bench/bag_writer.py``. All write the same messages in turn, several times over: the profile of a Go2 (30
-pictures of 150 KB and 230 small messages a second), and 10,000 small messages a second. Ours ends a chunk and waits for the disk
-once a second of the recording, and computes the SHA-256 of the file; ``mcap, as ours`` does the same (its ``flush``, a file that
-hashes). The others do neither. `rosbags` leaves out CRC-32s as well. Memory is the most that was allocated at once.
+Run it as ``python bench/bag_writer.py``. All write the same messages in turn, several times: the profile of a Go2 (30 images of
+150 KB and 230 small messages per second), and 10,000 small messages per second. Ours ends a chunk and syncs once per second of
+the
+recording, and computes the SHA-256 of the file; ``mcap, as ours`` does the same (its ``flush``, a file that hashes). The others
+do
+neither. `rosbags` skips CRC-32s as well. Memory is the peak allocation.
 """
 
 from __future__ import annotations
@@ -39,11 +41,11 @@ BUDGET_US = 10.0
 SECOND = 10**9
 PICTURE_BYTES, SMALL_BYTES = 150_000, 300
 Stream = Sequence[tuple[int, int, bytes]]
-"""(channel's place, log time, bytes)."""
+"""(channel index, log time, bytes)."""
 
 
 def stream(per_second: int, pictures: int, seconds: float) -> Stream:
-    """Evenly spread; pictures are noise, as JPEGs are, and small messages look like records do: half of each is zeros."""
+    """Evenly spaced; images are noise, like JPEGs, and small messages resemble records: half of each is zeros."""
     noise = random.Random(1)
     picture = [noise.randbytes(PICTURE_BYTES) for _ in range(31)]  # zstd finds repeats in a chunk
     small = [noise.randbytes(SMALL_BYTES // 2) + bytes(SMALL_BYTES // 2) for _ in range(97)]
@@ -96,7 +98,7 @@ def mcap(compression: CompressionType) -> Callable[[Path, Stream], None]:
 
 
 class Hashing(io.RawIOBase):
-    """A file that knows its SHA-256."""
+    """A file that computes its SHA-256."""
 
     def __init__(self, path: Path) -> None:
         self.file = path.open('wb', buffering=0)
@@ -140,7 +142,7 @@ def mcap_as_ours(compression: CompressionType) -> Callable[[Path, Stream], None]
 
 
 def bytes_alone(folder: Path, messages: Stream) -> None:
-    """What the bytes cost whoever writes them so: CRC-32, SHA-256, the write of a megabyte at a time, a sync a second."""
+    """The cost of the bytes for any such writer: CRC-32, SHA-256, writes of a megabyte, one sync per second."""
     digest = hashlib.sha256()
     size = sum(31 + len(cdr) for _, _, cdr in messages)
     block = random.Random(2).randbytes(1 << 20)
@@ -163,7 +165,7 @@ WRITERS: dict[str, Callable[[Path, Stream], None]] = {
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Every writer once a round, so that what else the machine does falls on all of them."""
+    """Every writer once per round, so that other load affects all of them."""
     loads = {'profile': stream(260, 30, options.seconds), 'small': stream(10_000, 0, max(options.seconds / 5, 1))}
     options.folder.mkdir(parents=True, exist_ok=True)
     figures: dict[str, dict[str, list[float]]] = {load: {name: [] for name in WRITERS} for load in loads}
@@ -185,7 +187,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 
 def _most_mb(write: Callable[[Path, Stream], None], folder: Path) -> float:
-    """Allocated at once over two seconds of the profile, beside the messages."""
+    """Peak allocation over two seconds of the profile, without the messages."""
     messages, place = stream(260, 30, 2), Path(tempfile.mkdtemp(dir=folder))
     tracemalloc.start()
     try:

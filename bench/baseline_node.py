@@ -1,8 +1,9 @@
-"""A plain logger as the integration guide sketches it (its Pattern 1), extended in its spirit to all topics of a Go2.
+"""A plain logger as sketched by the integration guide (its Pattern 1), extended to all topics of a Go2.
 
-A callback a message; an S3 put inside the callback; keys by the second of now. What differs from the sketch is said where it
-does. It is what ``node_cpu.py`` holds the node against, and does by itself: ``python bench/baseline_node.py``. On SIGINT it
-prints what it received and put.
+One callback per message; an S3 put inside the callback; keys by the current second. Differences from the sketch are noted. It is
+the
+baseline of ``node_cpu.py``, and also runs on its own: ``python bench/baseline_node.py``. On SIGINT it prints what it received and
+put.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ BATCH_S = 1.0
 
 
 class BaselineNode(Node):  # type: ignore[misc]  # rclpy has no types
-    """Subscribes, converts and uploads, all on the executor's one thread."""
+    """Subscribes, converts and uploads, all on the executor's only thread."""
 
     def __init__(self, odom_skip: int, robot: str) -> None:
         super().__init__('baseline_node')
@@ -55,7 +56,7 @@ class BaselineNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.create_subscription(Go2State, '/go2_states', self.on_state, 10)
         self.create_subscription(JointState, '/joint_states', self.on_joints, 10)
         self.create_subscription(LowState, '/lowstate', self.on_lowstate, 10)
-        # With the guide's depth alone (RELIABLE) these two would hear nothing: their publishers are BEST_EFFORT.
+        # With the guide's depth alone (RELIABLE) these two would receive nothing: their publishers are BEST_EFFORT.
         self.create_subscription(PointCloud2, '/point_cloud2', self.on_cloud, qos_profile_sensor_data)
         self.create_subscription(CameraInfo, '/camera/camera_info', self.on_camera_info, qos_profile_sensor_data)
 
@@ -80,7 +81,7 @@ class BaselineNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.upload('odom', 'odom.json', json.dumps(odom).encode(), 'application/json')
 
     def on_cloud(self, msg: Any) -> None:
-        """One a second, its points as they lie in the message: the guide wants PCD, which costs a header more."""
+        """One per second, its points unchanged: the guide wants PCD, which adds only a header."""
         self.received['/point_cloud2'] += 1
         if self.received['/point_cloud2'] % CLOUD_SKIP == 0:
             self.upload('lidar', 'scan.bin', bytes(msg.data), 'application/octet-stream')
@@ -94,7 +95,7 @@ class BaselineNode(Node):  # type: ignore[misc]  # rclpy has no types
             self.upload('camera_info', 'front.json', json.dumps(body).encode(), 'application/json')
 
     def on_imu(self, msg: Any) -> None:
-        """The guide's batches of a second."""
+        """The guide's batches of one second."""
         self.received['/imu'] += 1
         self.batch('imu', {
             'quaternion': msg.quaternion.tolist(), 'gyroscope': msg.gyroscope.tolist(), 'rpy': msg.rpy.tolist(),
@@ -115,7 +116,7 @@ class BaselineNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.batch('joints', {'name': list(msg.name), 'position': list(msg.position)})
 
     def on_lowstate(self, msg: Any) -> None:
-        """One a second: battery and motors."""
+        """One per second: battery and motors."""
         self.received['/lowstate'] += 1
         if self.received['/lowstate'] % LOWSTATE_SKIP:
             return
@@ -134,7 +135,7 @@ class BaselineNode(Node):  # type: ignore[misc]  # rclpy has no types
             self.upload(sensor, f'{sensor}.json', body, 'application/json')
 
     def upload(self, sensor: str, name: str, body: bytes, content_type: str) -> None:
-        """Synchronously, under a key by the second, as in the guide."""
+        """Synchronously, with a key by the second, as in the guide."""
         now = datetime.now().strftime('%Y%m%d/%H%M%S')  # noqa: DTZ005 - as in the guide
         start = time.perf_counter()
         try:
@@ -159,8 +160,8 @@ def main() -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        told = {'received': node.received, 'puts': node.puts, 'failures': node.failures, 'put_s': node.put_s}
-        print(json.dumps(told), flush=True)
+        report = {'received': node.received, 'puts': node.puts, 'failures': node.failures, 'put_s': node.put_s}
+        print(json.dumps(report), flush=True)
         node.destroy_node()
         rclpy.try_shutdown()
 

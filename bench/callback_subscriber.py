@@ -1,6 +1,6 @@
-"""The least that rclpy lets a subscriber be: raw messages, a callback that counts, a SingleThreadedExecutor.
+"""The minimal rclpy subscriber: raw messages, a callback that counts, a SingleThreadedExecutor.
 
-It answers each line of standard input with how many it has received. ``intake.py`` holds the node against it.
+It answers each line of standard input with the number of received messages. The baseline of ``intake.py``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How much code there is, and how much of it a reader opens to follow something: the tables of docs/evidence/development.md.
+"""The size of the code, and how much of it a reader opens to follow something: the tables of docs/evidence/development.md.
 
 ``python bench/code.py [CHECKOUT]`` counts the package of a checkout, this one by default. ``--trails`` also runs its node and its
-MissionDataLogger with a profiler, in an environment with ROS: a module is on a trail when one of its functions is called more
-often while the thing happens than in as much time without it.
+MissionDataLogger with a profiler, in an environment with ROS: a module is on a trail if one of its functions is called more often
+during the event than in an equal time without it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ sys.setprofile(note)
 
 
 def count(root: Path) -> dict[str, int]:
-    """By what is counted; a class name is public when it has no underscore and stands at the top of a module."""
+    """Counts by kind; a class name is public if it has no underscore and is at the top level of a module."""
     paths = {name_of(path, root): path for path in root.rglob('*.py')}
     importers: dict[str, set[str]] = defaultdict(set)
     names: Counter[str] = Counter()
@@ -84,13 +84,13 @@ def imported(tree: ast.Module) -> set[str]:
 
 
 def modules(counts: dict[str, int], without: dict[str, int]) -> set[str]:
-    """Those with a function that was called more often, by half and by three calls at least."""
+    """Modules with a function that was called more often, by half and by at least three calls."""
     more = {name: max(1.5 * calls, calls + 3) for name, calls in without.items()}
     return {name.rpartition(':')[0] for name, calls in counts.items() if calls >= more.get(name, 3)}
 
 
 def trails() -> dict[str, int]:
-    """Run by the code that is measured: its package and its tests are the first on the path."""
+    """Run by the measured code: its package and its tests are first on the path."""
     from domains import free_domain  # noqa: PLC0415 - of the tests
     from e2e.processes import Processes  # noqa: PLC0415
 
@@ -174,7 +174,7 @@ def followed(processes: Any, node: Any, folder: Path) -> dict[str, int]:
 
 
 def logged(home: Path) -> int:
-    """The modules that calls of a mission's logger enter."""
+    """The modules entered by calls of a mission's logger."""
     from shadowhound_data_logger import MissionDataLogger  # noqa: PLC0415
 
     found: set[str] = set()

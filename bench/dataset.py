@@ -1,10 +1,13 @@
-"""``MissionDataset`` through torch's DataLoader with two workers beside the integration guide's loop, from first byte to array.
+"""``MissionDataset`` through torch's DataLoader with two workers next to the integration guide's loop, from first byte to array.
 
-Run it as ``python bench/dataset.py [--frames 900] [--rounds 3] [--json]`` where torch is installed (the extra ``train``). The
-guide's loop is its own: boto3's paginator, ``download_file`` one by one, then each file read and decoded (by Pillow). Both take
-turns on the same frames, 640 x 480, in the same SeaweedFS; a round's ratio is of two runs side by side. Ours is measured three
-times: single JPEGs from the stream, the same by number (shuffled), and archives of a second. Making the dataset (the
-catalog's question) and starting the workers is in it; importing torch, boto3 and Daft is in neither.
+Run it as ``python bench/dataset.py [--frames 900] [--rounds 3] [--json]`` with torch installed (the extra ``train``). The guide's
+loop is its own: boto3's paginator, ``download_file`` one by one, then each file read and decoded (by Pillow). Both take turns on
+the
+same frames, 640 x 480, in the same SeaweedFS; a round's ratio is of two consecutive runs. Ours is measured three times: single
+JPEGs
+from the stream, the same by number (shuffled), and archives of a second. Creating the dataset (the catalog's query) and starting
+the
+workers is included; importing torch, boto3 and Daft is not.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ KIND: Final = 'sensor_msgs/msg/CompressedImage'
 
 
 def picture(number: int) -> bytes:
-    """A JPEG of 640 x 480 that is as large as a camera's, about 45 KB."""
+    """A JPEG of 640 x 480 of a camera's size, about 45 KB."""
     rng = np.random.default_rng(number % 16)
     coarse = rng.integers(0, 255, (60, 80, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     noise = rng.integers(0, 12, coarse.shape, np.uint8)
@@ -53,7 +56,7 @@ def picture(number: int) -> bytes:
 
 
 def fill(store: S3Store, frames: int) -> int:
-    """Single frames of the robot thor, archives of the same of tachi, and their catalogs; bytes of the frames."""
+    """Single frames of the robot thor, archives of the same of tachi, and their catalogs; returns the bytes of the frames."""
     bodies = [picture(number) for number in range(16)]
     puts: list[tuple[str, bytes, dict[str, str]]] = []
     for number in range(frames):
@@ -62,10 +65,10 @@ def fill(store: S3Store, frames: int) -> int:
     for begin in range(0, frames, FRAMES_HZ):
         numbers = range(begin, min(begin + FRAMES_HZ, frames))
         stamps = [FIRST_NS + number * SECOND // FRAMES_HZ for number in numbers]
-        told = [b'{"stamp_ns":%d,"topic":"/camera/compressed"}' % stamp for stamp in stamps]
+        report = [b'{"stamp_ns":%d,"topic":"/camera/compressed"}' % stamp for stamp in stamps]
         pairs = [
             (stamp, (('jpg', bodies[number % 16]), ('json', about)))
-            for number, stamp, about in zip(numbers, stamps, told, strict=True)
+            for number, stamp, about in zip(numbers, stamps, report, strict=True)
         ]
         packed = pack_tar(ArchiveFile(f'{stamp:019d}.{kind}', stamp, body) for stamp, files in pairs for kind, body in files)
         puts.append(_object('tachi', 'tar', packed, stamps[0], stamps[-1], len(stamps)))
@@ -73,7 +76,9 @@ def fill(store: S3Store, frames: int) -> int:
         list(pool.map(lambda put: obstore.put(store, put[0], put[1]), puts))
     for robot in ('thor', 'tachi'):
         rows = [
-            schema.row_of(schema.BUCKET, key, len(body), 'image/jpeg', told) for key, body, told in puts if key.startswith(robot)
+            schema.row_of(schema.BUCKET, key, len(body), 'image/jpeg', report)
+            for key, body, report in puts
+            if key.startswith(robot)
         ]
         for start in range(0, len(rows), 60):
             name = f'{utc(rows[start]["t_start_ns"]):%Y%m%dT%H%M%S}_b'
@@ -91,7 +96,7 @@ def _object(robot: str, extension: str, body: bytes, first: int, last: int, coun
 
 
 def guide(settings: Any, folder: Path) -> int:
-    """The guide's loop, and its second half: what was downloaded as arrays."""
+    """The guide's loop, and its second half: the downloads as arrays."""
     shutil.rmtree(folder, ignore_errors=True)
     s3 = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
                       aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip

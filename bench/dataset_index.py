@@ -1,8 +1,10 @@
-"""What ``MissionDataset`` of a million rows costs before its first sample: seconds and memory.
+"""The cost of a ``MissionDataset`` of a million rows before its first sample: seconds and memory.
 
 Run it as ``python bench/dataset_index.py [--rows 1000000] [--rounds 3] [--json]``. The rows are frames of a second in hourly
-parts, in a folder as ``shadowhound-data fetch`` leaves it. Each round is a process of its own that has made a dataset of one of
-the parts before, so that libraries are loaded and have planned once; the index is what one process hands to its workers.
+parts,
+in a folder as written by ``shadowhound-data fetch``. Each round is a separate process that has created a dataset of one part
+before,
+so that libraries are loaded and have planned once; the index is what one process passes to its workers.
 """
 
 from __future__ import annotations
@@ -43,16 +45,16 @@ print(json.dumps({'seconds': round(time.monotonic() - began, 2), 'rows': len(mad
 
 
 def fill(folder: Path, first: int, last: int) -> None:
-    """A part for each of these hours."""
+    """One part for each of these hours."""
     for hour in range(first, last):
         rows = []
         for second in range(hour * HOUR, (hour + 1) * HOUR):
             stamp = FIRST_NS + second * SECOND
             key = f'thor/camera/{utc(stamp):%Y%m%d/%H%M%S}_front.jpg'
-            told = {'robot': 'thor', 'sensor': 'camera', 'topic': '/camera/compressed', 'type': KIND, 'count': '1',
+            report = {'robot': 'thor', 'sensor': 'camera', 'topic': '/camera/compressed', 'type': KIND, 'count': '1',
                     't_start_ns': str(stamp), 't_end_ns': str(stamp), 'sha256': hashlib.sha256(key.encode()).hexdigest(),
                     'pose': f'{second}.0 2.0 0.5 odom', 'battery_pct': '80'}  # fmt: skip
-            rows.append(schema.row_of(schema.BUCKET, key, 45_000, 'image/jpeg', told))
+            rows.append(schema.row_of(schema.BUCKET, key, 45_000, 'image/jpeg', report))
         name = f'{utc(rows[0]["t_start_ns"]):%Y%m%dT%H%M%S}_b'
         part = folder / schema.OBJECTS.part_key('thor', schema.date_of(rows[0]), name)
         part.parent.mkdir(parents=True, exist_ok=True)

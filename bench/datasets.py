@@ -1,9 +1,11 @@
-"""``export lerobot`` beside lerobot's own writer on the same pictures, 640 x 480 at 30 Hz: frames a second, CPU, memory.
+"""``export lerobot`` next to lerobot's own writer on the same images, 640 x 480 at 30 Hz: frames per second, CPU, memory.
 
-Run it as ``python bench/datasets.py [--frames 450] [--rounds 3] [--json]`` where lerobot has an environment
-(docs/development.md). Ours reads the objects of a mission, aligns them with the odometry, traces each value and writes AV1;
-lerobot reads JPEGs of a folder, in its default way and with ``streaming_encoding``. Reading and decoding the JPEGs is in all
-of them, importing modules in none. Memory is the most that a process had.
+Run it as ``python bench/datasets.py [--frames 450] [--rounds 3] [--json]`` if lerobot has an environment (docs/development.md).
+Ours reads the objects of a mission, aligns them with odometry, records the source of each value and writes AV1; lerobot reads
+JPEGs
+of a folder, by default and with ``streaming_encoding``. Reading and decoding the JPEGs is included in all of them, importing
+modules
+in none. Memory is the peak of a process.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ print(json.dumps({'seconds': time.perf_counter() - begun, 'frames': found.added[
 
 
 def pictures(folder: Path, frames: int) -> Path:
-    """A mission of so many frames in a store, and the same JPEGs in a folder; returns the store."""
+    """A mission with this many frames in a store, and the same JPEGs in a folder; returns the store."""
     here = [str(HERE.parent / 'test'), str(HERE.parent / 'test/datasets')]
     sys.path[:] = [*here, *(path for path in sys.path if path != str(HERE))]  # a benchmark is called "lake" as a folder is there
     import recorded  # noqa: PLC0415 - the missions of the tests
@@ -51,7 +53,7 @@ def pictures(folder: Path, frames: int) -> Path:
     coarse = rng.integers(0, 200, (SIZE[0] // 8, SIZE[1] // 8, 3), np.uint8).repeat(8, 0).repeat(8, 1)
 
     def pixels(stamp_ns: int) -> Any:
-        """A room that moves by a pixel a frame, with a sensor's noise."""
+        """A room that moves by one pixel per frame, with sensor noise."""
         number = stamp_ns * FPS // 1_000_000_000
         noise = rng.integers(0, 6, coarse.shape, np.uint8)
         return np.ascontiguousarray(np.roll(coarse, number % SIZE[1], axis=1) + noise)
@@ -71,15 +73,19 @@ def pictures(folder: Path, frames: int) -> Path:
 
 
 def run(command: list[str]) -> dict[str, float]:
-    """What a process says, with its CPU seconds and the most memory (MB) that it had."""
+    """The output of a process, with its CPU seconds and peak memory (MB)."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         assert process.stdout is not None
-        said = process.stdout.read()
+        reported = process.stdout.read()
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise SystemExit(f'{command[1]} ended with exit code {process.returncode}')
-    return {**json.loads(said.splitlines()[-1]), 'cpu_s': used.ru_utime + used.ru_stime, 'memory_mb': used.ru_maxrss * 1024 / 1e6}
+        raise SystemExit(f'{command[1]} exited with code {process.returncode}')
+    return {
+        **json.loads(reported.splitlines()[-1]),
+        'cpu_s': used.ru_utime + used.ru_stime,
+        'memory_mb': used.ru_maxrss * 1024 / 1e6,
+    }
 
 
 def measure(options: argparse.Namespace) -> Report:

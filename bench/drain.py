@@ -1,8 +1,9 @@
-"""Prints how fast a backlog leaves the spool, beside a bare boto3 thread pool that sends the same objects to the same server.
+"""Prints how fast a backlog is uploaded, next to a bare boto3 thread pool that sends the same objects to the same server.
 
-Run it as ``python bench/drain.py [--threads N] [--rounds N] [--folder F] [--json]``; it starts a SeaweedFS for it and
-F should lie on the disk that the spool will be on. Both ways take turns, so that other work on the machine slows both alike:
-each ratio is of two runs side by side, and their median counts. The CPU is this process's, without the server's.
+Run it as ``python bench/drain.py [--threads N] [--rounds N] [--folder F] [--json]``; it starts a SeaweedFS, and F should be on
+the
+disk that the spool will be on. Both take turns, so that other load affects both: each ratio is of two consecutive runs, and their
+median counts. The CPU is this process's, without the server's.
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ DEADLINE_S = 600.0
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One backlog sent."""
+    """One uploaded backlog."""
 
     seconds: float
     cpu_seconds: float
 
 
 def backlog(count: int, size: int, label: str) -> list[DataObject]:
-    """Objects of random content, as the encoders make them."""
+    """Objects with random content, as made by the encoders."""
     return [
         DataObject(
             bucket=BUCKET, key=f'thor/camera/{label}/{number:06d}_front.jpg', body=os.urandom(size), content_type='image/jpeg',
@@ -71,7 +72,7 @@ def timed(send: Callable[[], object]) -> Run:
 
 
 def drain(folder: Path, settings: StoreSettings, threads: int, objects: Sequence[DataObject]) -> Run:
-    """From a full spool until every object is confirmed and its outcome durable."""
+    """From a full spool until every object is confirmed and its outcome is durable."""
     upload = UploadSettings(threads=threads)
     spool = Spool(folder / 'spool', SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), 'thor')
     spool.open()
@@ -98,7 +99,7 @@ def drain(folder: Path, settings: StoreSettings, threads: int, objects: Sequence
 
 
 def bare(folder: Path, settings: StoreSettings, threads: int, objects: Sequence[DataObject]) -> Run:
-    """From files until every put returned: the same requests, nothing verified, nothing written down."""
+    """From files until every put returned: the same requests, without verification or bookkeeping."""
     paths: list[tuple[Path, DataObject, dict[str, str]]] = []
     for number, item in enumerate(objects):
         path = folder / f'bare-{number}'
@@ -129,7 +130,7 @@ def bare(folder: Path, settings: StoreSettings, threads: int, objects: Sequence[
 
 
 def measure(folder: Path, settings: StoreSettings, threads: int, rounds: int, scale: float) -> list[dict[str, Any]]:
-    """One row for each kind of backlog."""
+    """One row per kind of backlog."""
     rows = []
     drain(folder, settings, threads, backlog(50, 1000, 'warm'))
     for whole, size in BACKLOGS:
@@ -146,7 +147,7 @@ def measure(folder: Path, settings: StoreSettings, threads: int, rounds: int, sc
 
 
 def summary(count: int, ours: Sequence[Run], theirs: Sequence[Run]) -> dict[str, Any]:
-    """Medians, and each ratio with its quartiles: over 1 we are faster, or cheaper."""
+    """Medians, and each ratio with its quartiles: above 1 we are faster, or cheaper."""
     speed = [their.seconds / our.seconds for our, their in zip(ours, theirs, strict=True)]
     cpu = [our.cpu_seconds / their.cpu_seconds for our, their in zip(ours, theirs, strict=True)]
     return {

@@ -1,7 +1,7 @@
-"""Prints what the encode stage costs a message, in microseconds of CPU, for the messages of a Go2.
+"""Prints the CPU microseconds per message of the encode stage, for the messages of a Go2.
 
-Run it as ``python bench/encode_formats.py``; it needs no ROS and takes some ten seconds. ``--json > before.jsonl`` keeps the
-figures, ``--against before.jsonl`` shows the change as a ratio (those of one machine only can be compared).
+Run it as ``python bench/encode_formats.py``; it needs no ROS and takes some ten seconds. ``--json > before.jsonl`` saves the
+results, ``--against before.jsonl`` shows the change as a ratio (comparable only on one machine).
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class Case(NamedTuple):
     cdr: bytes
     messages: int = 1
     format: str = ''
-    """Another one than the sensor's own."""
+    """Set if it is not the sensor's own format."""
 
 
 class Row(NamedTuple):
-    """What was measured; microseconds are a message, bytes are the whole object's."""
+    """The measurement; microseconds are per message, bytes are of the complete object."""
 
     name: str
     decode_us: float
@@ -54,7 +54,7 @@ class Row(NamedTuple):
 
 
 class Messages:
-    """Makes the messages of the bench."""
+    """Creates the messages of the benchmark."""
 
     def __init__(self) -> None:
         self.store = get_typestore(Stores.LATEST)
@@ -88,7 +88,7 @@ class Messages:
         return self.header(), turn, self.rng.normal(size=9), rate, self.rng.normal(size=9), push, self.rng.normal(size=9)
 
     def depth(self) -> Any:
-        """640 x 480 millimeters of a slanted wall, with noise and a tenth of holes."""
+        """640 x 480 millimeters of a slanted wall, with noise and 10 % of holes."""
         wall = np.linspace(500, 6000, 640)[None, :] + np.linspace(0, 2000, 480)[:, None]
         noisy = (wall + self.rng.normal(0, 4, wall.shape)).astype(np.uint16)
         return np.where(self.rng.random(wall.shape) < 0.1, np.uint16(0), noisy)
@@ -102,7 +102,7 @@ class Messages:
         return *start, 0, 0.1, 30, 31, 28.7, 1.3, np.zeros(4, np.uint16), 0, 99
 
     def cloud(self, points: int, floats: int) -> tuple[Any, ...]:
-        """A cloud of x y z intensity, ``floats`` float32 apart."""
+        """A cloud of x y z intensity with a stride of ``floats`` float32."""
         names = ('x', 'y', 'z', 'intensity')
         fields = [self.of('sensor_msgs/msg/PointField', name, 4 * index, 7, 1) for index, name in enumerate(names)]
         data = self.floats(points * floats).view(np.uint8)
@@ -118,7 +118,7 @@ class Messages:
         return self.header(), [f'joint_{index}' for index in range(12)], self.floats(12).astype(np.float64), none, none
 
     def cases(self) -> Iterator[Case]:
-        """One a format, by the sensor and type that mostly use it."""
+        """One per format, with the sensor and type that usually use it."""
         yield from self.numbers()
         yield from self.images()
         cloud = 'sensor_msgs/msg/PointCloud2'
@@ -156,7 +156,7 @@ class Messages:
 
 
 def measure(case: Case, sensor: SensorSettings, types: MessageTypes) -> Row:
-    """The best of several runs: the machine's other work only ever adds."""
+    """The best of several runs: other load can only add time."""
     samples = tuple(Sample(STAMP_NS + index, case.cdr) for index in range(case.messages))
     batch = Batch(case.sensor, f'/{case.sensor}', case.type, samples, len(case.cdr) * case.messages)
     encoding = encode(batch, sensor, 'thor', types)
@@ -169,7 +169,7 @@ def measure(case: Case, sensor: SensorSettings, types: MessageTypes) -> Row:
 
 
 def best_us(call: Callable[[], object]) -> float:
-    timer = Timer(call, timer=time.thread_time)  # what other processes take does not count
+    timer = Timer(call, timer=time.thread_time)  # CPU of other processes does not count
     number = max(1, int(timer.autorange()[0] * SECONDS_EACH / 0.2 / REPEATS))
     return min(timer.repeat(REPEATS, number)) / number * 1e6
 

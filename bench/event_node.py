@@ -1,6 +1,6 @@
-"""The node, which besides writes down how long each round of its intake took, and what the ring held. For ``event_ring.py``.
+"""The node, which also records how long each round of its intake took, and the content of the ring. For ``event_ring.py``.
 
-A round begins when it is due, so that one whose thread had to wait for its turn is longer by that. At its end it prints
+A round starts when it is due, so that one whose thread had to wait for the CPU is longer. When it exits it prints
 ``{"rounds": [[began, seconds], ...], "writing": [[began, ended], ...]}``, monotonic clock.
 """
 

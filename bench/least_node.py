@@ -1,8 +1,10 @@
-"""Stores what the node stores, and no more: it reads, keeps and encodes the same with the same code, and does without all else.
+"""Stores what the node stores, and nothing else: it reads, keeps and encodes with the same code.
 
-One thread. What one poll closes becomes files that are synced, one commit of SQLite, and a put each, one after the other; then
-the files go. No ledger, no status, no queue, no lock, nothing that is told, noticed, tried again or survived. It is what
-``node_least.py`` measures beside the node. For each line on standard input it prints the seconds of CPU of each of its steps.
+One thread. The batches of one poll become files that are synced, one SQLite commit, and one put each, in sequence; then the files
+are
+deleted. There is no ledger, status, queue, lock, report, retry or recovery. ``node_least.py`` measures it next to the node. For
+each
+line on standard input it prints the CPU seconds of each of its steps.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ CREATE TABLE objects (id INTEGER PRIMARY KEY, bucket TEXT, key TEXT, state TEXT,
 
 
 class Topic:
-    """One that is kept."""
+    """A topic that is kept."""
 
     def __init__(self, node: Node, sensor: SensorSettings, topic: str, types: MessageTypes) -> None:
         publisher = endpoints(node, topic)[0]
@@ -60,7 +62,7 @@ class Topic:
 
 
 class LeastNode:
-    """All of it; CPU by step in ``used``."""
+    """The complete program; CPU by step in ``used``."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.used, self.put = folder, Counter[str](), 0

@@ -1,7 +1,8 @@
-"""A day of pictures at 1 Hz asked by likeness: 86,400 vectors of 512 numbers, against one product of plain numpy in the same run.
+"""Similarity search over a day of images at 1 Hz: 86,400 vectors of 512 numbers, relative to one product of plain numpy.
 
-Run it as ``python bench/likeness.py [--vectors 86400] [--numbers 512] [--json]``. The search alone is measured, as the answer
-needs it: reading the parts and the catalog's rows comes beside it (``read_s``).
+Run it as ``python bench/likeness.py [--vectors 86400] [--numbers 512] [--json]``. Only the search is measured, as the answer
+needs
+it: reading the parts and the catalog's rows is separate (``read_s``).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ LIMIT: Final = 30
 
 
 class Numbers:
-    """Stands for a model: its vectors are drawn."""
+    """A stand-in for a model: its vectors are random."""
 
     name, digest = 'drawn numbers', hashlib.sha256(b'drawn').hexdigest()
 

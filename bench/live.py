@@ -1,19 +1,22 @@
 #!/usr/bin/env python3
-"""What the live page costs and how late it is: CPU of node and page without viewers and with some, and links that are slow.
+"""The cost and the delay of the live page: CPU of node and page with and without viewers, and slow links.
 
     scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --round-trip 100 | --beside 0.5
-        | --browser | --pairs 7 | --minutes 60 | --floor] [--kills 2]
+    | --browser | --pairs 7 | --minutes 60 | --floor] [--kills 2]
 
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
-namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
-WebRTC and decodes it. With ``--round-trip`` each packet takes half of so many ms, as through a VPN, beside one that takes
-none; it needs root as well. ``--beside`` gives a second viewer that reads so many Mbit/s, and says what that does to the first.
-``--browser`` opens the page in a Chromium on a machine of its own (a network namespace): how late items come and are drawn, the
-first frame, outages of 10 s. ``--pairs`` measures the node's CPU with and without viewers in turns, ``--minutes`` what the page
-holds while viewers come and go. ``--floor`` measures the page with one viewer beside processes that only read the same topics
-(live_floor.py), all at the same time. ``--kills`` kills it while eight watch, one of which never reads.
+namespace whose uplink from the page has this many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
+WebRTC
+and decodes it. With ``--round-trip`` each packet is delayed by half of this many ms, as through a VPN, next to a viewer without
+delay; it needs root as well. ``--beside`` adds a second viewer that reads this many Mbit/s, and measures its effect on the first.
+``--browser`` opens the page in a Chromium on a simulated separate machine (a network namespace): delays of items until they
+arrive
+and are drawn, the first frame, outages of 10 s. ``--pairs`` alternates the node's CPU with and without viewers,
+``--minutes`` measures the page's memory while viewers come and go. ``--floor`` measures the page with one viewer next to
+processes that only read the same topics (live_floor.py), all at the same time. ``--kills`` kills it while eight watch; one of
+them never reads.
 
-One line of JSON for each part, then the bars; the exit code is 1 where one is missed.
+One line of JSON for each part, then the bars; the exit code is 1 if one is missed.
 """
 
 from __future__ import annotations
@@ -52,15 +55,15 @@ KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
 WATCHING = 8
 """While the page is killed."""
 TAKINGS = round(4 / 1.1, 1)
-"""Times the CPU of taking the messages that the page may use with one viewer: 4 % of a core was the aim where that cost 1.1 %."""
+"""The page's CPU with one viewer relative to taking the messages: 4 % of a core was the goal when taking them cost 1.1 %."""
 MAX_LATE_MS, FULL_SHARE = 60.0, 0.9
-"""What an IMU message may take besides the way, and the part of the bytes of a near viewer that a far one must get."""
+"""Maximum delay of an IMU message besides the link's, and the share of a near viewer's bytes that a far one must receive."""
 BESIDE = 1.2
-"""Times its p95 alone that a viewer beside one on a slow link may have."""
+"""Maximum p95 of a viewer next to one on a slow link, relative to its p95 alone."""
 
 
 class Watcher:
-    """A viewer without a browser: counts what comes by kind, and how late it is by the clock of this machine."""
+    """A viewer without a browser: counts items by kind, and their delay by the clock of this machine."""
 
     def __init__(self, url: str, topics: list[str]) -> None:
         self.url, self.topics = url, topics
@@ -70,7 +73,7 @@ class Watcher:
         self.token = ''
 
     async def run(self, *, reads: bool = True, bytes_s: float = 0.0) -> None:
-        """``bytes_s``: it reads no faster."""
+        """``bytes_s``: maximum read rate."""
         jar = aiohttp.CookieJar(unsafe=True)  # of addresses too
         async with (
             aiohttp.ClientSession(headers={'Origin': self.url.rstrip('/')}, cookie_jar=jar) as session,
@@ -86,10 +89,10 @@ class Watcher:
             said_s = time.monotonic()
             serve_policy_topics: asyncio.Task[None] | None = None
 
-            async def tell() -> None:  # after what came with it, as link.js does
-                if (said := frames.acknowledgement()) is not None:
+            async def tell() -> None:  # after what arrived with it, as in link.js
+                if (reported := frames.acknowledgement()) is not None:
                     self.acknowledgements += 1
-                    await ws.send_bytes(said)
+                    await ws.send_bytes(reported)
 
             async for message in ws:
                 self.bytes += len(message.data)
@@ -127,7 +130,7 @@ class Watcher:
 
 
 class Video:
-    """A receiver of video: how late decoded frames are. aiortc gives a frame when the next one begins to arrive."""
+    """A receiver of video: the delay of decoded frames. aiortc returns a frame when the next one starts to arrive."""
 
     def __init__(self, late_ms: dict[str, list[float]]) -> None:
         self.late_ms = late_ms
@@ -166,15 +169,17 @@ def private_mb(pid: int) -> float:
 
 
 def watched(url: str, count: int, seconds: float, pids: dict[str, int], *,
-            deaf: int = 0, video: bool = False, token: str = '') -> dict[str, Any]:  # fmt: skip
-    """So many viewers for so long, ``deaf`` of which read nothing: what each gets, and the CPU of the processes, % of a core."""
+            silent: int = 0, video: bool = False, token: str = '') -> dict[str, Any]:  # fmt: skip
+    """This many viewers for this long, ``silent`` of them read nothing: what each receives, and the CPU of the processes, % of a
+    core.
+    """
     watchers = [Watcher(url, TOPICS) for _ in range(count)]
     for watcher in watchers:
         watcher.takes_video, watcher.token = video, token
 
     async def run() -> tuple[float, dict[str, float]]:
-        tasks = [asyncio.create_task(watcher.run(reads=place >= deaf)) for place, watcher in enumerate(watchers)]
-        await asyncio.sleep(15 if video else 4)  # discovery; receivers of video learn what their link carries
+        tasks = [asyncio.create_task(watcher.run(reads=place >= silent)) for place, watcher in enumerate(watchers)]
+        await asyncio.sleep(15 if video else 4)  # discovery; receivers of video learn the bandwidth of their link
         for watcher in watchers:
             watcher.late_ms.clear()
             watcher.acknowledgements = 0
@@ -191,12 +196,12 @@ def watched(url: str, count: int, seconds: float, pids: dict[str, int], *,
         return took, used
 
     took, used = asyncio.run(run())
-    return {'viewers': count, 'deaf': deaf, 'cpu_percent': used, 'private_mb': private_mb(pids['live']),
-            'each': [watcher.told(took) for watcher in watchers[deaf:][:2]]}  # fmt: skip
+    return {'viewers': count, 'deaf': silent, 'cpu_percent': used, 'private_mb': private_mb(pids['live']),
+            'each': [watcher.told(took) for watcher in watchers[silent:][:2]]}  # fmt: skip
 
 
 def killed(url: str, live: Process) -> int:
-    """Kill the page while so many watch, of which the first never reads; how many of the others had been sent something."""
+    """Kill the page while viewers watch, the first without reading; returns how many of the others had been sent something."""
     watchers = [Watcher(url, TOPICS) for _ in range(WATCHING)]
 
     async def run() -> None:
@@ -213,7 +218,7 @@ def killed(url: str, live: Process) -> int:
 
 
 def in_browser(url: str, token: str, machines: Machines, folder: Path, seconds: float) -> dict[str, Any]:
-    """The page in a Chromium with software GL on a machine of its own; in the end the link to it is cut for 10 s, three times."""
+    """The page in a Chromium with software GL on a simulated separate machine; finally its link is cut for 10 s, three times."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415 - for this part alone
 
     with sync_playwright() as playwright:
@@ -225,13 +230,13 @@ def in_browser(url: str, token: str, machines: Machines, folder: Path, seconds: 
         page.locator('input[name=token]').fill(token)
         page.locator('button.primary').click()
         until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
-        page.reload()  # signed in: how long until there is a frame
+        page.reload()  # signed in: time until the first frame
         until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
         found: dict[str, Any] = {'first_frame_ms': round(page.evaluate('shadowhound.first'))}
         with browser.new_context(viewport={'width': 1280, 'height': 800}, storage_state=page.context.storage_state()) as cold:
-            page.goto('about:blank')  # it draws nothing meanwhile
+            page.goto('about:blank')  # it draws nothing in that time
             fresh = cold.new_page()
-            fresh.goto(url)  # signed in, and nothing of the page is in its cache
+            fresh.goto(url)  # signed in, with an empty cache
             until(lambda: fresh.evaluate('window.shadowhound?.first ?? 0') > 0, 'there is a frame')
             found['first_frame_cold_ms'] = round(fresh.evaluate('shadowhound.first'))
         page.goto(url)
@@ -263,7 +268,7 @@ def in_browser(url: str, token: str, machines: Machines, folder: Path, seconds: 
 
 
 def paired(url: str, viewers: int, seconds: float, pairs: int, pids: dict[str, int]) -> dict[str, Any]:
-    """The node's CPU with viewers less that without, in turns, points of a core."""
+    """The node's CPU with viewers minus without, alternating, % of a core."""
     more = []
     for _ in range(pairs):
         without, with_viewers = (watched(url, count, seconds, pids)['cpu_percent']['node'] for count in (0, viewers))
@@ -272,8 +277,8 @@ def paired(url: str, viewers: int, seconds: float, pairs: int, pids: dict[str, i
             'median': statistics.median(more)}  # fmt: skip
 
 
-def lasting(url: str, viewers: int, minutes: int, pid: int) -> dict[str, Any]:
-    """What the page holds at the end of each minute, in which other viewers have come and gone."""
+def over_minutes(url: str, viewers: int, minutes: int, pid: int) -> dict[str, Any]:
+    """The page's memory at the end of each minute, while other viewers come and go."""
     held = []
     for _ in range(minutes):
         row = watched(url, viewers, 52.0, {'live': pid})
@@ -285,7 +290,7 @@ def lasting(url: str, viewers: int, minutes: int, pid: int) -> dict[str, Any]:
 
 
 def beside(url: str, seconds: float, slow_mbps: float) -> dict[str, Any]:
-    """What a viewer on a slow link does to one beside it: p95 of the fast one alone, and with the slow one."""
+    """The effect of a slow viewer on another one: p95 of the fast one alone, and with the slow one."""
 
     async def run(*, with_slow: bool) -> dict[str, Any]:
         fast, slow = Watcher(url, TOPICS), Watcher(url, TOPICS)
@@ -303,19 +308,19 @@ def beside(url: str, seconds: float, slow_mbps: float) -> dict[str, Any]:
 
 
 def floor(url: str, seconds: float, processes: Processes, pids: dict[str, int]) -> dict[str, Any]:
-    """The page with one viewer, and what only reads the same: the node of a process, to hear the topics, and to take them."""
+    """The page with one viewer, and processes that only read the same: with a node, with subscriptions, and with takes."""
     readers = {}
     for do in ('join', 'hear', 'take'):
         log = processes.folder / f'{do}.log'
         readers[do] = Process(do, [str(Path(__file__).parent / 'live_floor.py'), do, *TOPICS], log, processes.environ)
         processes.started.append(readers[do])
     for reader in readers.values():
-        reader.said('ready')
+        reader.await_log('ready')
     return watched(url, 1, seconds, {**pids, **{do: reader.popen.pid for do, reader in readers.items()}})
 
 
 def shape(url: str, mbps: float) -> None:
-    """What the page sends carries no more, in packets as on a network; all else on this loopback is as fast as ever."""
+    """Limit the page's uplink, with packets as on a network; other traffic on this loopback is not limited."""
     port = url.rstrip('/').rpartition(':')[2]
     for command in (
         'ip link set lo mtu 1500',
@@ -343,7 +348,7 @@ def late(row: dict[str, Any], limits: dict[str, float], where: str) -> list[Bar]
 
 
 def cost_bars(rows: Sequence[dict[str, Any]]) -> list[Bar]:
-    """Of the series without a viewer, with one, with some, without one."""
+    """For the series without a viewer, with one, with some, without."""
     alone, first, some, after = (row['cpu_percent']['live'] for row in rows[:4])
     more = (some - first) / max(1, rows[2]['viewers'] - 1)
     return [
@@ -386,7 +391,7 @@ def browser_bars(row: dict[str, Any]) -> list[Bar]:
 
 
 def beside_bars(row: dict[str, Any]) -> list[Bar]:
-    """Of each kind the mean of both runs, since one run's p95 alone differs from the other's as well."""
+    """The mean of both runs for each kind, because the p95 of a single run varies."""
     found = []
     for kind in ('imu', 'camera', 'cloud'):
         alone, with_slow = (statistics.mean(run[kind] for run in row[name]) for name in ('alone', 'beside'))
@@ -401,7 +406,7 @@ def floor_bars(row: dict[str, Any]) -> list[Bar]:
 
 
 def ending_bars(node: Node, url: str, live: Process, processes: Processes, sim: Process, kills: int) -> list[Bar]:
-    """Kill the page so often, then end the robot and the node: nothing may be missing in its ledger."""
+    """Kill the page this often, then stop the robot and the node: nothing may be missing in its ledger."""
     watching = []
     for _ in range(kills):
         watching.append(killed(url, live))
@@ -424,7 +429,7 @@ def ending_bars(node: Node, url: str, live: Process, processes: Processes, sim: 
 
 
 def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[Bar]:
-    """What one call measures, a line for each row; the bars of all of it."""
+    """Run one measurement, with a line for each row; returns its bars."""
     machines = Machines(stack, os.getpid()) if given.browser else None
     processes = Processes(folder, stack.enter_context(free_domain()), f'r{secrets.token_hex(4)}')
     stack.callback(processes.end)
@@ -448,7 +453,7 @@ def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[
         what = f'CPU of the node with {given.viewers} viewers more than without, median of {given.pairs} pairs'
         bars = [at_most(what, 0.3, row['median'], 'points of a core', row['node_points_more'])]
     elif given.minutes:
-        row = tell(lasting(url, given.viewers, given.minutes, live.popen.pid))
+        row = tell(over_minutes(url, given.viewers, given.minutes, live.popen.pid))
         bars = [at_most('private memory of the page at any minute', 120, max(row['private_mb']), 'MB', row['private_mb'])]
     elif given.floor:
         bars = floor_bars(tell(floor(url, given.seconds, processes, pids)))
@@ -467,7 +472,7 @@ def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[
         bars = []
     else:
         bars = cost_bars([tell(watched(url, count, given.seconds, pids)) for count in (0, 1, given.viewers, 0)])
-        tell(watched(url, given.viewers, given.seconds / 2, pids, deaf=given.viewers - 1))
+        tell(watched(url, given.viewers, given.seconds / 2, pids, silent=given.viewers - 1))
     return bars + ending_bars(node, url, live, processes, sim, given.kills)
 
 

@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""What the live page cannot cost less than: a process that subscribes as the page does, and takes the messages or does not.
+"""The minimum cost of the live page: a process that subscribes as the page does, and takes the messages or does not.
 
     scripts/with-env python bench/live_floor.py join|hear|take [TOPIC ...]
 
-``join``: the node alone; ``hear``: subscribed to the topics, and nothing is taken; ``take``: all is taken as the page does it,
-and thrown away. It says that it is ready, and runs until it is ended. ``bench/live.py --floor`` measures it beside the page.
+``join``: only the node; ``hear``: subscribed to the topics without taking messages; ``take``: takes all messages as the page
+does,
+and discards them. It reports that it is ready, and runs until it is stopped. ``bench/live.py --floor`` measures it next to the
+page.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ AWAY_S = 4.0
 SETTLE_MS = 4000
 FRESH_S = 60.0
 FLEET = (('rover', 20, 0), ('loki', 40, 1840), ('odin', 3 * 3600, 0), ('freya', 26 * 3600, 0), ('thor', 90, 12))
-"""Robots: seconds since the last object, messages that are missing today."""
+"""Robots: seconds since the last object, messages missing today."""
 
 
 def main() -> None:
@@ -64,7 +64,7 @@ def main() -> None:
 
 
 def robot(browser: Browser, folder: Path, to: Path, seconds: float) -> None:
-    """The page of a robot, now and back in time."""
+    """The page of a robot, live and in the past."""
     with free_domain() as domain:
         processes = Processes(folder, domain, f'r{secrets.token_hex(4)}')
         try:
@@ -112,14 +112,14 @@ def fleet(browser: Browser, folder: Path, to: Path) -> None:
                     for second in range(60)]  # fmt: skip
             for date in sorted(set(map(schema.date_of, rows))):
                 add_part(store, [one for one in rows if schema.date_of(one) == date], 'a', folder / 'tmp')
-            said = [complete(name, 'j', 1, from_ns=at_ns - 60 * SECOND, to_ns=at_ns, received=3000, skipped=0, **IMU)]
+            reported = [complete(name, 'j', 1, from_ns=at_ns - 60 * SECOND, to_ns=at_ns, received=3000, skipped=0, **IMU)]
             if lost:
-                said.append(statement(
+                reported.append(statement(
                     name, GAP, 'j/1', 1, kind='missed', cause='transport', count=lost, merged=1, publisher='imu', **IMU,
                     from_ns=at_ns - 30 * SECOND, to_ns=at_ns - 20 * SECOND,
                 ))  # fmt: skip
-            for date in sorted({date_of(one) for one in said}):
-                body = parts.encode([one for one in said if date_of(one) == date], GAPS)
+            for date in sorted({date_of(one) for one in reported}):
+                body = parts.encode([one for one in reported if date_of(one) == date], GAPS)
                 add(store, folder / 'tmp', GAPS.part_key(name, date, 'a'), body, {'robot': name})
     with served(home) as url:
         page = opened(browser, url, {**DESKTOP, 'height': 790})

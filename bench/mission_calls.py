@@ -37,9 +37,9 @@ JPEG: Final = b'\xff\xd8' + os.urandom(150_000)
 MEDIAN_S, P99_S = 1e-3, 10e-3
 PLAIN_CALLS: Final = 50
 START_S: Final = {'up': 0.1, 'away': 0.1, 'hung': 2.1}
-"""Of ``start_mission`` right after the constructor."""
+"""For ``start_mission`` right after the constructor."""
 STARTS, AFTER_S, BUSY, START_MEDIAN_MS = 12, 0.01, 10, 100.0
-"""Rounds, the time between constructor and call, busy processes, and what the median of the rounds must stay below."""
+"""Rounds, the time between constructor and call, busy processes, and the maximum for the median of the rounds."""
 
 
 def timed(call: Callable[[], object]) -> float:
@@ -49,7 +49,7 @@ def timed(call: Callable[[], object]) -> float:
 
 
 def calls(home: Path, seconds: float) -> dict[str, list[float]]:
-    """Seconds of each call of a mission at ``RATE_HZ``, by what was called."""
+    """Seconds of each call of a mission at ``RATE_HZ``, by method."""
     took: dict[str, list[float]] = {'start_mission': [], 'log_robot_state': [], 'log_camera_frame': [], 'end_mission': []}
     logger = MissionDataLogger(home=home)
     try:
@@ -70,7 +70,7 @@ def calls(home: Path, seconds: float) -> dict[str, list[float]]:
 
 @contextmanager
 def busy(count: int) -> Iterator[None]:
-    """So many processes that compute without a pause."""
+    """This many processes that compute without a pause."""
     processes = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(count)]
     try:
         yield
@@ -81,7 +81,7 @@ def busy(count: int) -> Iterator[None]:
 
 
 def starts(folder: Path, rest: MlflowRest, experiment_id: str) -> dict[str, list[float]]:
-    """Seconds that ``start_mission`` takes, and the bare request for a run right after it; they take turns.
+    """Seconds of ``start_mission``, and of the bare request for a run right after it; they alternate.
 
     Each round has a new home, and waits at its end until the sender of that home has exited.
     """
@@ -98,7 +98,7 @@ def starts(folder: Path, rest: MlflowRest, experiment_id: str) -> dict[str, list
         took['start_mission'].append(start)
         took['runs/create'].append(bare)
         took['ratio'].append(start / bare)
-        rest.json('GET', f'runs/get?run_id={run_id}')  # raises if that is no run
+        rest.json('GET', f'runs/get?run_id={run_id}')  # raises if that is not a run
         logger.end_mission(True, 1.0, 1.0)
         logger.close(60.0)
         pid = json.loads((home / MISSIONS / 'replay.json').read_text(encoding='utf-8'))['pid']

@@ -1,4 +1,4 @@
-"""Prints how fast a backlog of missions is replayed, as a share of what ``log_batch`` of 1,000 metrics reaches alone.
+"""Prints how fast a backlog of missions is replayed, as a share of the rate of ``log_batch`` with 1,000 metrics.
 
 Run it as ``python bench/missions.py [--points N] [--folder F] [--json]``. Both send to the same MLflow server on SQLite.
 """
@@ -27,7 +27,7 @@ BATCH: Final = 1000
 
 
 def alone(uri: str, points: int) -> float:
-    """Points a second of MLflow's client with nothing around it."""
+    """Points per second of MLflow's bare client."""
     from mlflow import MlflowClient  # noqa: PLC0415 - after its environment is set
     from mlflow.entities import Metric  # noqa: PLC0415
 
@@ -41,7 +41,7 @@ def alone(uri: str, points: int) -> float:
 
 
 def replayed(uri: str, home: Path, points: int) -> float:
-    """Points a second of a journal's delivery, from the first byte to the run's end."""
+    """Points per second of a journal's delivery, from the first byte to the run's end."""
     logger = MissionDataLogger(home=home, replay=False, start_timeout_s=0.0)
     logger.start_mission('bench', 'backlog')
     for number in range(points):

@@ -1,9 +1,10 @@
-"""Prints how fast slices leave in parts, beside boto3's ``upload_fileobj`` that sends the same files to the same server.
+"""Prints how fast slices are uploaded in parts, next to boto3's ``upload_fileobj`` with the same files and server.
 
-Run it as ``python bench/multipart.py [--slices N] [--mebibytes M] [--rounds N] [--folder F] [--json]``; it starts a SeaweedFS for
-it. Both ways take turns, so that other work on the machine slows both alike: each ratio is of two runs side by side, and their
-median counts. The CPU is this process's, without the server's. Ours sends the parts of one slice one after the other, verifies
-the whole against its SHA-256 and could be taken up at any part; boto3's sends up to ten parts at a time and does neither.
+Run it as ``python bench/multipart.py [--slices N] [--mebibytes M] [--rounds N] [--folder F] [--json]``; it starts a SeaweedFS.
+Both
+take turns, so that other load affects both: each ratio is of two consecutive runs, and their median counts. The CPU is this
+process's, without the server's. Ours sends the parts of one slice in sequence, verifies the complete file against its SHA-256 and
+could resume at any part; boto3's sends up to ten parts at a time and does neither.
 """
 
 from __future__ import annotations
@@ -32,19 +33,19 @@ from shadowhound_data_logger.stores import open_store
 
 BUCKET = 'sensor-data'
 AT_ONCE = 2
-"""Slices under way: the half of the default threads that large objects have."""
+"""Concurrent slices: half of the default threads are for large objects."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """All slices sent once."""
+    """All slices uploaded once."""
 
     seconds: float
     cpu_seconds: float
 
 
 def slices(folder: Path, count: int, size: int) -> list[SpooledObject]:
-    """Files of random content, as the spool knows them."""
+    """Files with random content, as in the spool."""
     made = []
     for number in range(count):
         path, content = folder / f'{number}.mcap', os.urandom(size)
@@ -62,13 +63,13 @@ def timed(send: Callable[[SpooledObject], object], items: Sequence[SpooledObject
 
 
 def named(items: Sequence[SpooledObject], label: str) -> list[SpooledObject]:
-    """The same files under other keys."""
+    """The same files with other keys."""
     return [SpooledObject(item.id, BUCKET, f'thor/rosbags/{label}/{item.key}', item.path, item.size, item.sha256,
                           item.content_type, {}, 8, 0) for item in items]  # fmt: skip
 
 
 def measure(settings: StoreSettings, items: Sequence[SpooledObject], rounds: int) -> list[tuple[Run, Run]]:
-    """(ours, theirs) of each round, both once without being measured."""
+    """(ours, theirs) of each round, after one round of both that is not measured."""
     client = boto3.client(
         's3', endpoint_url=settings.endpoint_url, region_name=settings.region, aws_access_key_id=settings.access_key_id,
         aws_secret_access_key=settings.secret_access_key, config=Config(s3={'addressing_style': 'path'}),
@@ -87,7 +88,7 @@ def measure(settings: StoreSettings, items: Sequence[SpooledObject], rounds: int
 
 
 def summary(runs: Sequence[tuple[Run, Run]], mebibytes: int) -> dict[str, Any]:
-    """Medians of the ratios, ours to theirs, and our own figures."""
+    """Medians of the ratios, ours to theirs, and our absolute values."""
     time_ratios = [ours.seconds / theirs.seconds for ours, theirs in runs]
     cpu_ratios = [ours.cpu_seconds / theirs.cpu_seconds for ours, theirs in runs]
     return {

@@ -1,10 +1,10 @@
-"""CPU of the node at its default profile against a plain node, at the same time, on the same simulated robot and S3 server.
+"""CPU of the node at its default profile relative to a plain node, at the same time, on the same simulated robot and S3 server.
 
-The whole process tree of each counts, user and system time. Two runs: the plain node once as the guide sketches it, once
-with odometry at 1 Hz as the node stores it by default. Each run is cut into rounds for the spread.
+The complete process tree of each counts, user and system time. Two runs: the plain node once as sketched in the guide, once with
+odometry at 1 Hz as the node stores it by default. Each run is split into rounds for the spread.
 
-The node is also held against its own floor: the threads of its middleware and its intake thread, without which nothing would be
-heard at all. The rest is what encoders, spool, uploads and the main loop cost.
+The node is also compared with its own floor: the threads of its middleware and its intake thread, without which it would receive
+nothing. The rest is the cost of encoders, spool, uploads and the main loop.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ WARM_S = 5.0
 ROUNDS = 6
 INTAKE = 'intake'
 COMM_BYTES = 15
-"""Of a thread's name the system keeps so many."""
+"""Maximum bytes of a thread's name in the kernel."""
 VARIANTS = {'guide': 1, 'kinder': 50}
-"""Every how many odometry messages the plain node uploads one."""
+"""The plain node uploads every n-th odometry message."""
 
 
 def run(folder: Path, odom_skip: int, seconds: float) -> dict[str, Any]:
-    """CPU seconds of each program in each round, and what became of the messages."""
+    """CPU seconds of each program in each round, and the fate of the messages."""
     with World(folder) as world:
         node = world.node()
         plain = world.program('baseline_node', 'baseline_node.py', '--odom-skip', str(odom_skip))
@@ -58,7 +58,7 @@ def run(folder: Path, odom_skip: int, seconds: float) -> dict[str, Any]:
 
 
 def _floor(node: Program, world: World) -> float:
-    """Seconds of CPU of the intake and of threads that are not the node's own, which are those of the middleware."""
+    """CPU seconds of the intake and of the middleware's threads, which are those without a name of the node."""
     workers = status.read(world.spool, ROBOT, SystemClock.of_this_machine()).node.workers
     ours = {'main', *(name[:COMM_BYTES] for name in workers)} - {INTAKE}
     return sum(used for name, used in _proc.threads(node.pid).items() if name not in ours)
@@ -78,7 +78,7 @@ def _rounds(programs: dict[str, Program], seconds: float, after: Callable[[], ob
 
 
 def _objects(world: World) -> int:
-    """What is left in the bucket of all that the plain node put there."""
+    """Objects left in the bucket of all that the plain node put there."""
     assert world.tower is not None
     store = open_store(world.tower.store_settings(), UploadSettings())
     try:

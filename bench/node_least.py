@@ -1,8 +1,10 @@
-"""What the node costs above its floor, against a program that only encodes, writes, commits and puts (least_node.py).
+"""The cost of the node above its floor, relative to a program that only encodes, writes, commits and puts (least_node.py).
 
 Both read the same simulated robot at the same time and put as many objects to the same S3 server. The floor is the node's
-middleware and its intake, as in ``node_cpu.py``. What the other program takes for its steps is what storing an object costs with
-these encoders, a file and a put each, before anything is accounted for, told, tried again or recovered.
+middleware
+and its intake, as in ``node_cpu.py``. The other program's steps are the cost of storing an object with these encoders, one file
+and
+one put each, without accounting, reports, retries or recovery.
 """
 
 from __future__ import annotations
@@ -22,11 +24,11 @@ ROUNDS = 4
 STEPS = ('encode', 'spool', 'put')
 MOST = 2.5
 UNEQUAL = 0.05
-"""By how much their objects may differ: they are counted at their own moments."""
+"""Allowed difference in objects: they are counted at different moments."""
 
 
 def _used(world: World, node: Program, least: Program) -> dict[str, float]:
-    """Seconds of CPU until now, and objects."""
+    """CPU seconds until now, and objects."""
     steps = least.ask()
     return {'node': node.cpu_s(), 'floor': _floor(node, world), 'least': least.cpu_s(), 'objects': steps.pop('objects'),
             'node_objects': world.ledger()['objects']['spooled'], **steps}  # fmt: skip

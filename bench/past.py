@@ -1,10 +1,14 @@
-"""Measures how fast the live page looks back into a spool of eight hours: the first moment, later ones, and playing.
+"""Measures how fast the live page shows the past of a spool of eight hours: the first moment, later ones, and playing.
 
-Run it as ``python bench/past.py [--objects 500000] [--delivered 0.5] [--program DIR ...] [--json]``. It makes the index of a
-spool whose objects begin evenly over eight hours, the older part of them delivered, with files for the last
-minutes. Then it asks the process that reads the past (``live/history.py``) what the page asks: days, the timeline, a moment,
-moments that follow one another, jumps within those minutes, and a timeline of an hour. With ``--program`` it does the same with
-the package in each of these folders, in turns, so that two versions can be compared on a busy machine.
+Run it as ``python bench/past.py [--objects 500000] [--delivered 0.5] [--program DIR ...] [--json]``. It creates the index of a
+spool
+whose objects are evenly spread over eight hours, the older part of them delivered, with files for the last minutes. Then it sends
+the
+requests of the page to the process that reads the past (``live/history.py``): days, the timeline, a moment, consecutive moments,
+jumps
+within those minutes, and a timeline of an hour. With ``--program`` it alternates between the packages in these folders, so that
+two
+versions can be compared on a busy machine.
 """
 
 from __future__ import annotations
@@ -42,7 +46,7 @@ SENSORS = {
 
 
 def objects(count: int) -> Iterator[tuple[int, str, str, str, str]]:
-    """(stamp, sensor, topic, type, ending) in the order of time."""
+    """(stamp, sensor, topic, type, ending) in order of time."""
     turns = [(sensor, *of) for sensor, of in SENSORS.items() for _ in range(of[2])]
     step_ns = HOURS * 3600 * SECOND // count
     for number in range(count):
@@ -51,7 +55,7 @@ def objects(count: int) -> Iterator[tuple[int, str, str, str, str]]:
 
 
 def make(folder: Path, count: int, delivered: float) -> int:
-    """The spool; when its last object begins."""
+    """Create the spool; returns the start of its last object."""
     picture = bytes(simplejpeg.encode_jpeg(np.random.default_rng(1).integers(0, 255, (240, 320, 3), np.uint8), 60, 'RGB'))
     with closing(Index(folder / 'index.db')) as index:
         index.open()
@@ -94,7 +98,7 @@ class Child:
         self.popen = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environ, cwd=program)
 
     def ask(self, do: str, **more: Any) -> tuple[float, dict[str, Any]]:
-        """How long the answer took, and its head."""
+        """Duration of the request, and the head of the answer."""
         assert self.popen.stdin is not None
         assert self.popen.stdout is not None
         began_s = time.monotonic()
@@ -114,7 +118,7 @@ class Child:
 
 
 def measured(program: Path, spool: Path, last_ns: int) -> dict[str, float]:
-    """Seconds, and moments in a second."""
+    """Seconds, and moments per second."""
     last_ms = last_ns // 1_000_000
     with closing(Child(program, spool)) as child:
         robots_s, _ = child.ask('robots')

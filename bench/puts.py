@@ -1,9 +1,12 @@
-"""What a put costs this process, in milliseconds of CPU and in megabytes, beside obstore and boto3.
+"""CPU milliseconds and memory of a put in this process, next to obstore and boto3.
 
-Run it as ``python bench/puts.py``. Each way puts the same small objects into one SeaweedFS, from as many threads,
-in turn, several times over: from a file, with metadata, never over another object. Ours reads the file and checks it against its
-SHA-256, and the server verifies a CRC-32. obstore hashes what it sends; of checksums that a server verifies it has SHA-256 and
-CRC-64. The memory is what a process has more of after its first round, imports included.
+Run it as ``python bench/puts.py``. Each client puts the same small objects into one SeaweedFS, from as many threads, in turn,
+several
+times: from a file, with metadata, without overwriting. Ours reads the file and checks it against its SHA-256, and the server
+verifies
+a CRC-32. obstore hashes what it sends; of checksums that a server verifies it has SHA-256 and CRC-64. The memory is the increase
+of a
+process after its first round, imports included.
 """
 
 from __future__ import annotations
@@ -90,7 +93,7 @@ def objects(folder: Path, label: str, count: int) -> list[SpooledObject]:
 
 
 def timed(pool: ThreadPoolExecutor, put: Put, items: Sequence[SpooledObject]) -> float:
-    """Milliseconds of CPU an object, of all threads of this process."""
+    """CPU milliseconds per object, of all threads of this process."""
     start = process_time()
     list(pool.map(put, items))
     return (process_time() - start) * 1e3 / len(items)
@@ -101,7 +104,7 @@ def resident_mb() -> float:
 
 
 def grown_mb(way: str, settings: StoreSettings, folder: Path) -> float:
-    """In a process of its own, with nothing of the others in it."""
+    """In a separate process, without the other clients."""
     program = (
         f'import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import puts; from puts import *\n'
         f'items, before = objects(Path({str(folder)!r}), "memory-{way}", 300), resident_mb()\n'
@@ -115,7 +118,7 @@ def grown_mb(way: str, settings: StoreSettings, folder: Path) -> float:
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Every way once a round, so that what else the machine does falls on all of them."""
+    """Every client once per round, so that other load affects all of them."""
     options.folder.mkdir(parents=True, exist_ok=True)
     count = int(options.seconds * 50)
     figures: dict[str, list[float]] = {name: [] for name in WAYS}

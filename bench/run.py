@@ -1,7 +1,8 @@
-"""``make bench``: all benchmarks one after the other, then docs/evidence/benchmarks.md with what they found.
+"""``make bench``: all benchmarks one after the other, then docs/evidence/benchmarks.md with their results.
 
-About half an hour; ``--quick`` takes three or so and leaves docs/ alone. Exit code 1 when a bar is missed, or a benchmark
-fails (then docs/ stays as it is, too). Nothing else should run on the machine meanwhile.
+About half an hour; ``--quick`` takes about three minutes and does not change docs/. Exit code 1 if a bar is missed, or a
+benchmark
+fails (docs/ is then unchanged, too). Nothing else should run on the machine during that time.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ DRAIN_BAR: Final = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A benchmark and how it is called."""
+    """A benchmark and its command."""
 
     name: str
     arguments: tuple[str, ...] = ()
     quick: tuple[str, ...] | None = ()
-    """None: too long for a quick look."""
+    """None: too long for ``--quick``."""
 
 
 STEPS: Final = (
@@ -66,9 +67,9 @@ FOLDERLESS: Final = ('encode_formats',)
 
 
 def run(step: Step, folder: Path, *, quick: bool) -> dict[str, Any] | None:
-    """What a benchmark says, as JSON, with its command and how long it took; its progress goes to standard error.
+    """The output of a benchmark as JSON, with its command and duration; its progress is printed on standard error.
 
-    None when it failed: the others are measured all the same.
+    None if it failed: the others are measured anyway.
     """
     arguments = [*((step.quick or ()) if quick else step.arguments), '--json']
     command = [f'bench/{step.name}.py', *arguments]
@@ -89,7 +90,7 @@ def run(step: Step, folder: Path, *, quick: bool) -> dict[str, Any] | None:
 
 
 def _bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The bars of the benchmarks that only give figures: those of the drain."""
+    """The bars of benchmarks that only give results: those of the drain."""
     return [
         {
             'what': f'drain of {row["objects"]} objects of {row["bytes"] / 1000:g} KB against {row["threads"]} threads of boto3',
@@ -101,7 +102,7 @@ def _bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def machine() -> dict[str, str]:
-    """What the figures were measured on."""
+    """The machine of the results."""
     from rclpy.utilities import get_rmw_implementation_identifier  # noqa: PLC0415 - only here, and it takes a while
 
     models = [line.partition(':')[2].strip() for line in Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
@@ -117,7 +118,7 @@ def machine() -> dict[str, str]:
 
 
 def _keep_rosbag2(found: Mapping[str, Any]) -> None:
-    """Where there is no rosbag2, what an earlier machine measured beside it stays, with the commit that it was measured at."""
+    """Without rosbag2, keep the results of an earlier machine, with their commit."""
     measured = found.get('bag_recording')
     if measured is None:
         return
@@ -130,7 +131,7 @@ def _keep_rosbag2(found: Mapping[str, Any]) -> None:
 
 
 def _earlier(name: str) -> dict[str, Any]:
-    """What the page has of a benchmark, with its commit and machine."""
+    """The page's earlier results of a benchmark, with its commit and machine."""
     benches = json.loads((DOCS / RESULTS).read_text(encoding='utf-8'))['benches']
     return {name: benches[name]} if name in benches else {}
 
@@ -145,7 +146,7 @@ def _ros() -> str:
 
 
 def _commit() -> str:
-    """Of the checkout; empty where it is none."""
+    """Of the checkout; empty if it is not one."""
     git = ['git', '-C', str(HERE)]
     head = subprocess.run([*git, 'rev-parse', '--short', 'HEAD'], capture_output=True, text=True, check=False).stdout.strip()
     changed = subprocess.run([*git, 'status', '--porcelain', '--untracked-files=no'], capture_output=True, text=True, check=False)

@@ -1,6 +1,6 @@
-"""What fleets of 1, 100 and 10,000 robots amount to, from measured rates: the tables of docs/scale.md.
+"""Numbers for fleets of 1, 100 and 10,000 robots, from measured rates: the tables of docs/scale.md.
 
-Run it as ``python bench/scale.py`` to print them, with ``--write`` to put them into the page. A test compares the two.
+Run it as ``python bench/scale.py`` to print them, with ``--write`` to update the page. A test compares the two.
 """
 
 from __future__ import annotations
@@ -14,24 +14,26 @@ from typing import Final
 PAGE: Final = Path(__file__).resolve().parents[1] / 'docs' / 'scale.md'
 FLEETS: Final = (1, 100, 10_000)
 HOURS: Final = 8
-"""That a robot works a day; all else is a day of them."""
+"""Hours per day that a robot works; everything else is for a day of these."""
 DAY_S: Final = HOURS * 3600
 PART_BYTES, ROW_BYTES = 4000, 81
-"""Of a part of the catalog, and of each row in it (measured with the rows of bench/lake.py: 23 take 5.9 KB, 360 take 33 KB)."""
+"""Bytes of a part of the catalog, and of each row in it (measured with the rows of bench/lake.py: 23 take 5.9 KB, 360 take 33
+KB).
+"""
 TABLE_ROW_BYTES: Final = 85
-"""Of a row in the table ``objects`` (``bench/fleet.py``, 200,000 rows of 10 robots; a sha256 hardly shrinks)."""
+"""Bytes of a row in the table ``objects`` (``bench/fleet.py``, 200,000 rows of 10 robots; a sha256 hardly compresses)."""
 PART_S: Final = 60
 """``catalog.period_s``."""
 LISTED: Final = 1000
-"""Keys a LIST answers, in S3."""
+"""Keys per LIST response in S3."""
 PUTS_A_CORE: Final = 190
-"""Objects of 50 KB confirmed a second, for each of two cores that robot and store shared (docs/evidence/benchmarks.md: 377)."""
+"""Objects of 50 KB confirmed per second, for each of two cores shared by robot and store (docs/evidence/benchmarks.md: 377)."""
 INDEX_BYTES: Final = 16
-"""Memory of a SeaweedFS volume server for an object (its README, "O(1) disk read")."""
+"""Memory of a SeaweedFS volume server per object (its README, "O(1) disk read")."""
 FILER_BYTES: Final = 1073
-"""Of its filer's LevelDB for an object with our metadata (measured on 12,000, its log included)."""
+"""Bytes in its filer's LevelDB per object with our metadata (measured on 12,000, its log included)."""
 PUT_DOLLARS, GET_DOLLARS, MONTH_DOLLARS = 0.005 / 1000, 0.0004 / 1000, 0.023
-"""Of one PUT or LIST, one GET, one GB for a month: S3 Standard in us-east-1 as we know it; yours will differ."""
+"""Prices of one PUT or LIST, one GET, one GB for a month: S3 Standard in us-east-1 as we know it; yours will differ."""
 DAYS: Final = 30
 
 
@@ -49,11 +51,12 @@ PROFILES: Final = (
     Profile('default, batches of 10 s as tar', 36e9 / 86_400, 0.8),
     Profile('full rate (go2_full_rate.yaml)', 384e9 / 86_400, 8),
 )
-"""The second one: camera, lidar, imu, states, joints, odom, lowstate each an object in 10 s, and the calibration hardly ever."""
+"""The second one: camera, lidar, imu, states, joints, odom, lowstate each one object per 10 s, and the calibration hardly ever.
+"""
 
 
 def flow(profile: Profile) -> Iterator[tuple[str, ...]]:
-    """Rows: what comes in."""
+    """Rows: incoming data."""
     for robots in FLEETS:
         objects = robots * profile.objects_s
         yield (
@@ -65,8 +68,9 @@ def flow(profile: Profile) -> Iterator[tuple[str, ...]]:
 def catalog(profile: Profile) -> Iterator[tuple[str, ...]]:
     """Rows: the rows of a day, and the requests of a query over all robots' day: of row files, and of the tables.
 
-    Row files: a LIST per 1,000 of a robot, and a GET per file. Tables whose row files have expired: two LISTs for each robot
-    (are there newer row files of objects, of deletions?) and one GET for its file of that day.
+    Row files: a LIST per 1,000 of a robot, and a GET per file. Tables whose row files have expired: two LISTs for each robot (are
+    there
+    newer row files of objects, of deletions?) and one GET for its file of that day.
     """
     for robots in FLEETS:
         parts = robots * DAY_S // PART_S
@@ -78,12 +82,12 @@ def catalog(profile: Profile) -> Iterator[tuple[str, ...]]:
 
 
 def lists(keys: int) -> int:
-    """Requests that list so many."""
+    """Requests for listing this many keys."""
     return -(-keys // LISTED)
 
 
 def store(profile: Profile) -> Iterator[tuple[str, ...]]:
-    """Rows: what thirty days of objects are to a SeaweedFS, and to the price list of a cloud."""
+    """Rows: thirty days of objects in a SeaweedFS, and at a cloud's prices."""
     for robots in FLEETS:
         objects = robots * profile.objects_s * DAY_S * DAYS
         gigabytes = robots * profile.bytes_s * DAY_S * DAYS / 1e9
@@ -127,7 +131,7 @@ TABLES: Final = {'flow': flow, 'catalog': catalog, 'store': store}
 
 
 def size(count: float) -> str:
-    """As people say it, in powers of ten."""
+    """Human-readable, in powers of ten."""
     for unit in ('B', 'KB', 'MB', 'GB', 'TB', 'PB'):
         if count < 1000 or unit == 'PB':
             return f'{count:,.0f} {unit}' if count >= 100 or unit == 'B' else f'{count:.2g} {unit}'
@@ -136,7 +140,7 @@ def size(count: float) -> str:
 
 
 def markdown(name: str) -> str:
-    """One table, all profiles under each other."""
+    """One table, all profiles below each other."""
     lines = ['| ' + ' | '.join(('', *HEADS[name])) + ' |', '|' + '---|' * (len(HEADS[name]) + 1)]
     for profile in PROFILES:
         for number, row in enumerate(TABLES[name](profile)):
@@ -145,7 +149,7 @@ def markdown(name: str) -> str:
 
 
 def filled(page: str) -> str:
-    """The page with its tables made anew."""
+    """The page with updated tables."""
     for name in TABLES:
         before, rest = page.split(f'<!-- scale {name} -->\n')
         page = f'{before}<!-- scale {name} -->\n{markdown(name)}\n<!-- end {name} -->{rest.partition(f"<!-- end {name} -->")[2]}'

@@ -1,7 +1,8 @@
-"""``lake sink`` of a million rows to a server that takes all at once: how long our half takes, and how much memory.
+"""``lake sink`` of a million rows to a server that accepts everything immediately: the duration of our half, and its memory.
 
 Run it as ``python bench/sink.py [--days 30] [--folder F] [--json]``: 30 days are 720 parts of an hour in a folder store, a
-million rows, made as ``bench/lake.py`` makes them. The memory is that of the process that sends, a few times a second.
+million
+rows, as in ``bench/lake.py``. The memory is that of the sending process, sampled a few times per second.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from shadowhound_data_logger.stores import open_store
 HOURS: Final = 24
 LIMIT_S: Final = 300.0
 FLAT: Final = 1.25
-"""The highest memory of the second half, of the highest of the first."""
+"""Maximum memory of the second half, relative to the first."""
 LOOK_S: Final = 0.2
 PROGRAM: Final = 'from shadowhound_data_logger.cli.main import main; main()'
 
 
 def fill(folder: Path, days: int) -> int:
-    """The parts of these days in a folder store; how many rows they have."""
+    """The parts of these days in a folder store; returns the number of rows."""
     count = 0
     with closing(open_store(StoreSettings(directory=folder / 'store'), UploadSettings())) as store:
         for hour in range(days * HOURS):
@@ -54,7 +55,7 @@ def fill(folder: Path, days: int) -> int:
 
 
 def run(url: str, folder: Path) -> tuple[float, list[float], dict[str, Any]]:
-    """Seconds, its own memory (MB) meanwhile, and what it said."""
+    """Seconds, its private memory (MB), and its output."""
     environ = {'SHADOWHOUND_HOME': str(folder), 'PATH': '/usr/bin:/bin'}
     began = time.perf_counter()
     with subprocess.Popen(
@@ -70,15 +71,15 @@ def run(url: str, folder: Path) -> tuple[float, list[float], dict[str, Any]]:
         watcher = threading.Thread(target=poll, name='memory')
         watcher.start()
         assert child.stdout is not None
-        said = child.stdout.read()
+        reported = child.stdout.read()
         took = time.perf_counter() - began
         done.set()
         watcher.join()
-    return took, memory, json.loads(said)
+    return took, memory, json.loads(reported)
 
 
-class Taking(BaseHTTPRequestHandler):
-    """Answers as a server with empty indexes would, and looks at nothing but the lines."""
+class AcceptAll(BaseHTTPRequestHandler):
+    """Answers like a server with empty indexes, and only reads the lines."""
 
     protocol_version = 'HTTP/1.1'
 
@@ -100,13 +101,13 @@ class Taking(BaseHTTPRequestHandler):
     do_GET = do_PUT = do_POST = _serve  # noqa: N815 - as the library calls them
 
     def log_message(self, *_: Any) -> None:
-        """Says nothing."""
+        """Suppresses the log."""
 
 
 @contextmanager
-def taking() -> Iterator[str]:
+def accepting_server() -> Iterator[str]:
     """Such a server, in a thread of this process."""
-    server = ThreadingHTTPServer(('127.0.0.1', 0), Taking)
+    server = ThreadingHTTPServer(('127.0.0.1', 0), AcceptAll)
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, name='taking')
     thread.start()
@@ -119,22 +120,22 @@ def taking() -> Iterator[str]:
 
 
 def measure(options: argparse.Namespace) -> Report:
-    """Once all, then again what is there already."""
+    """Send everything once, then again what is already there."""
     shutil.rmtree(options.folder / 'sink_home', ignore_errors=True)
     home = options.folder / 'sink_home'
     home.mkdir(parents=True)
     count = fill(home, options.days)
-    with taking() as url:
-        took, memory, said = run(url, home)
+    with accepting_server() as url:
+        took, memory, reported = run(url, home)
         again_s, _, again = run(url, home)
     half = len(memory) // 2
     growth = max(memory[half:]) / max(memory[:half])
     figures = {
-        'rows': count, 'added': said['added'], 'seconds': took, 'rows_per_s': count / took, 'again_s': again_s,
+        'rows': count, 'added': reported['added'], 'seconds': took, 'rows_per_s': count / took, 'again_s': again_s,
         'again_added': again['added'], 'memory_mb': max(memory), 'memory_growth': growth,
     }  # fmt: skip
     limit_s = LIMIT_S * count / 1_000_000
-    wrong = abs(said['added'] - count) + again['added']
+    wrong = abs(reported['added'] - count) + again['added']
     return Report((
         Bar('all rows sent', f'at most {limit_s:.0f}', took, 's', took <= limit_s),
         Bar('memory of the second half, of the first', f'at most {FLAT}', growth, 'times', growth <= FLAT),

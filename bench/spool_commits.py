@@ -1,7 +1,7 @@
-"""Prints what a durable commit costs, and how long finding the next objects takes in a spool that is long.
+"""Prints the cost of a durable commit, and of finding the next objects in a long spool.
 
-Run it as ``python bench/spool_commits.py [--folder F] [--json]``; F should lie on the disk that the spool will be on. It takes
-a minute, most of it to make the long spool.
+Run it as ``python bench/spool_commits.py [--folder F] [--json]``; F should be on the disk that the spool will be on. It takes a
+minute, most of it for creating the long spool.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def opened(root: Path) -> Spool:
 
 
 def commits(root: Path, group: int, size: int) -> dict[str, float]:
-    """Commits and objects a second, and the share of a core, with ``group`` objects of ``size`` bytes a commit."""
+    """Commits and objects per second, and the share of a core, with ``group`` objects of ``size`` bytes per commit."""
     spool = opened(root)
     done, start, cpu = 0, perf_counter(), process_time()
     while (elapsed := perf_counter() - start) < SECONDS_EACH:
@@ -48,9 +48,9 @@ def commits(root: Path, group: int, size: int) -> dict[str, float]:
 
 
 def pending(root: Path, rows: int) -> dict[str, float]:
-    """Milliseconds of asking for 16 objects, of a commit of one, and of a start, with that many objects waiting."""
+    """Milliseconds for querying 16 objects, a commit of one, and a start, with this many waiting objects."""
     spool = opened(root)
-    with spool._connections.transaction() as index:  # without the syncing of commits, which is not what is measured here
+    with spool._connections.transaction() as index:  # without syncing commits, which is not measured here
         for number in range(rows):
             item = make(number)
             index.states.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)

@@ -1,8 +1,11 @@
-"""From the start of the node's process to the first message that it stores, beside a plain rclpy node with the same subscription.
+"""From the start of the node's process to the first message that it stores, next to a plain rclpy node with the same
+subscription.
 
-What is published before that is lost with each restart. A simulated Go2 publishes; the node starts, stops and starts again on the
-same spool, with an S3 server that answers. ``first`` is when the first message of ``/odom`` in the spool arrived, ``durable`` the
-commit that has the first object, ``stop`` the time from SIGINT to the end of the process.
+Messages published before that are lost with each restart. A simulated Go2 publishes; the node starts, stops and restarts on the
+same
+spool, with an S3 server that answers. ``first`` is when the first message of ``/odom`` in the spool arrived, ``durable`` the
+commit
+with the first object, ``stop`` the time from SIGINT to the exit of the process.
 """
 
 from __future__ import annotations

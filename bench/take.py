@@ -1,7 +1,7 @@
-"""CPU of a take through librcl, which tells number and publisher of each message, against rclpy's own on the same machine.
+"""CPU of a take through librcl, which reports number and publisher of each message, relative to rclpy's own on the same machine.
 
-Two subscriptions of one process hear the same publisher; each round drains both, in turns, and every message counts. It needs
-Fast DDS.
+Two subscriptions of one process receive from the same publisher; each round drains both, in turns, and every message counts. It
+needs Fast DDS.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader
 
 SIZES = {'small': (324, 2.0), 'large': (20_000, 2.0)}
-"""Bytes, and how many times as much as rclpy's a take may cost: a robot's LowState and a JPEG."""
+"""Bytes, and the maximum cost relative to rclpy: a robot's LowState and a JPEG."""
 MESSAGES = 500
-"""A round: less than the history holds."""
+"""Per round: less than the history holds."""
 ROUND_S = 0.4
-"""About what a round takes."""
+"""Approximate duration of a round."""
 
 
 def drained_us(one: Reader, count: int) -> float:
-    """Microseconds of CPU a message that waits already."""
+    """CPU microseconds per message that already waits."""
     received, used_s, end_s = 0, 0.0, time.monotonic() + 20.0
     while received < count and time.monotonic() < end_s:
         before_s = time.thread_time()
@@ -51,12 +51,12 @@ def pair(node: Any, topic: str) -> tuple[Reader, Reader]:
     for enough in ((), (99,)):
         reader.REPORTS_PUBLISHERS = enough  # type: ignore[misc]
         readers.append(Reader(node, plan, PolledGroup()))
-    assert [one._taker is None for one in readers] == [True, False], 'takes through librcl are not proved here'
+    assert [one._taker is None for one in readers] == [True, False], 'takes through librcl are not verified here'
     return readers[0], readers[1]
 
 
 def measured(node: Any, size: int, rounds: int) -> tuple[list[float], list[float]]:
-    """Microseconds a take of both, by rounds."""
+    """Microseconds per take of both, by rounds."""
     topic = f'/take_{size}'
     both = pair(node, topic)
     publisher = node.create_publisher(String, topic, 2 * MESSAGES)

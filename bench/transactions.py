@@ -1,9 +1,12 @@
-"""Prints for how long a commit keeps other processes out of the index: from BEGIN to the end of COMMIT.
+"""Prints how long a commit blocks other processes from the index: from BEGIN to the end of COMMIT.
 
-Run it as ``python bench/transactions.py [--folder F] [--json]``; F should lie on the disk that the spool will be on. It commits
-objects as many and as large as with the default profile, with every message stored, and as one commit of the writer may be at
-most. After each commit it syncs a file to which as many bytes were written as the transaction added to the index's log: that is
-what the disk itself takes. At last somebody asks for very many kept objects, and takes that back.
+Run it as ``python bench/transactions.py [--folder F] [--json]``; F should be on the disk that the spool will be on. It commits as
+many
+objects of the same size as the default profile, as with every message stored, and as the largest possible commit of the writer.
+After
+each commit it syncs a file with as many bytes as the transaction added to the index's log: that is the disk's share. Finally a
+client
+requests very many kept objects, and cancels the request.
 """
 
 from __future__ import annotations
@@ -30,40 +33,40 @@ PROFILES: Final = {
     'default profile': (3, 40_000, 0.1), 'every message stored': (20, 100_000, 0.1),
     'the largest commit': (MAX_OBJECTS, 130_000, 0.1),
 }  # fmt: skip
-"""Objects of so many bytes in a commit, and the seconds from one to the next."""
+"""Objects of this many bytes per commit, and the seconds between commits."""
 BAR_MS: Final = 50.0
 ASKED: Final = 50_000
-"""Kept objects that a request is made for."""
+"""Kept objects in a request."""
 
 
 class Timed:
-    """Stands before the connection of an index and times its transactions, in milliseconds."""
+    """Wraps the connection of an index and times its transactions, in milliseconds."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:
         self._connection = connection
         self._begun = 0.0
         self.held: list[float] = []
         self.committing: list[float] = []
-        """Of these, what COMMIT took: its sync, and at times a checkpoint, which keeps nobody out."""
+        """The COMMIT part of these: its sync, and sometimes a checkpoint, which blocks no other process."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._connection, name)
 
     def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        begun = perf_counter()
+        began = perf_counter()
         done = self._connection.execute(statement, *values)
         if statement == 'BEGIN IMMEDIATE':
             self._begun = perf_counter()
         elif statement == 'COMMIT':
             ended = perf_counter()
             self.held.append((ended - self._begun) * 1e3)
-            self.committing.append((ended - begun) * 1e3)
+            self.committing.append((ended - began) * 1e3)
         return done
 
 
 @contextmanager
 def timed(index: Index) -> Iterator[Timed]:
-    """The index with its connection timed."""
+    """The index with a timed connection."""
     connection = index._connection
     assert connection is not None
     found = Timed(connection)
@@ -75,11 +78,11 @@ def timed(index: Index) -> Iterator[Timed]:
 
 
 def raw_sync(descriptor: int, size: int) -> float:
-    """Milliseconds that the disk takes for so many bytes."""
+    """Milliseconds of the disk for this many bytes."""
     os.pwrite(descriptor, os.urandom(size), 0)
-    begun = perf_counter()
+    began = perf_counter()
     os.fdatasync(descriptor)
-    return (perf_counter() - begun) * 1e3
+    return (perf_counter() - began) * 1e3
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
@@ -88,7 +91,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 
 
 def measured(root: Path, objects: int, size: int, period_s: float, seconds: float) -> dict[str, object]:
-    """How long transactions were, and how much of that is the disk's."""
+    """How long transactions were, and the disk's share."""
     spool: Spool = opened(root)
     log = root / 'index.db-wal'
     raw: list[float] = []
@@ -99,11 +102,11 @@ def measured(root: Path, objects: int, size: int, period_s: float, seconds: floa
     with timed(spool._connections.writing) as found:
         end = perf_counter() + seconds
         while perf_counter() < end:
-            begun, before = perf_counter(), log.stat().st_size
+            began, before = perf_counter(), log.stat().st_size
             spool.commit([make(number + place, size) for place in range(objects)])
             number += objects
             raw.append(raw_sync(descriptor, max(4096, min(1 << 20, log.stat().st_size - before))))
-            sleep(max(0.0, begun + period_s - perf_counter()))
+            sleep(max(0.0, began + period_s - perf_counter()))
     os.close(descriptor)
     spool.close()
     share = sum(found.committing) / sum(found.held)
@@ -114,7 +117,7 @@ def measured(root: Path, objects: int, size: int, period_s: float, seconds: floa
 
 
 def asked(root: Path) -> dict[str, object]:
-    """How long the transactions are in which a request for very many objects is accepted, ended and forgotten."""
+    """Duration of the transactions that accept, end and delete a request for very many objects."""
     spool: Spool = opened(root)
     with spool._connections.writing.transaction():
         spool._connections.writing._db.executemany(
@@ -127,9 +130,9 @@ def asked(root: Path) -> dict[str, object]:
     chosen = [(item.id, item.bytes) for item in spool.requests.selectable()]
     row = RequestRow(id='0' * 32, requester='bench', priority=5, made_ns=1, expires_ns=1 << 62, received_ns=1, selection='{}')
     with timed(spool._connections.writing) as found:
-        begun = perf_counter()
+        began = perf_counter()
         row = spool.requests.accept(row, chosen)
-        accepted_s = perf_counter() - begun
+        accepted_s = perf_counter() - began
         spool.requests.close(row.id, CANCELLED)
         spool.requests.accept(row, [])
     spool.close()

@@ -1,7 +1,8 @@
-"""CPU and memory of the node that hears Cyclone DDS through Fast DDS, against one that hears Fast DDS, and the robot's own RMW.
+"""CPU and memory of a node that listens to Cyclone DDS through Fast DDS, relative to one on Fast DDS, and to the robot's own RMW.
 
-Each node has a domain and a publisher of its own, all run at the same time, and rounds take turns: one publisher sends, and what
-its node uses meanwhile is counted. The nodes keep next to nothing. A node in rmw_cyclonedds_cpp is there where that is installed.
+Each node has a separate domain and publisher, all run at the same time, and rounds take turns: one publisher sends, and the CPU
+of its
+node is counted. The nodes keep almost nothing. A node in rmw_cyclonedds_cpp is included if that is installed.
 """
 
 from __future__ import annotations
@@ -29,22 +30,22 @@ from e2e.processes import Node, Processes, Publisher
 
 ROBOT: Final = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
 KINDS: Final = {'small': (324, 500.0), 'large': (300_000, 30.0)}
-"""Bytes, and how many a second: a robot's LowState and a cloud."""
+"""Bytes, and rate per second: a robot's LowState and a cloud."""
 STRING: Final = 'std_msgs/msg/String'
 ROUNDS: Final = 5
 BAR: Final = {'small': 1.25, 'large': 2.0}
-"""A cloud of Fast DDS comes through shared memory, one of Cyclone DDS in many packets of UDP."""
+"""A cloud from Fast DDS arrives through shared memory, one from Cyclone DDS in many UDP packets."""
 MEMORY_BAR: Final = 1.1
 
 
 @dataclass(slots=True)
 class Side:
-    """A node and who publishes for it."""
+    """A node and its publisher."""
 
     node: Node
     publisher: Publisher
     used_us: dict[str, list[float]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
-    """CPU of the node for each message, by rounds."""
+    """CPU of the node per message, by rounds."""
 
     def round(self, kind: str, seconds: float) -> None:
         size, rate_hz = KINDS[kind]
@@ -58,7 +59,7 @@ class Side:
 
 
 def side(stack: ExitStack, folder: Path, *, cyclone: bool, rmw: str = 'auto') -> Side:
-    """Once both topics are heard."""
+    """Once both topics are received."""
     folder.mkdir()
     processes = Processes(folder, free_domain(), 'bench')
     stack.callback(processes.end)

@@ -1,11 +1,12 @@
-"""The sharp frames of a fleet, found by several worker processes: the catalog asked, the frames fetched, decoded and judged.
+"""Finds the sharp frames of a fleet with several worker processes: query the catalog, fetch the frames, decode and rate them.
 
     python examples/fleet_frames.py --since yesterday --near=-0.6,3.1,2 --workers 4
     python examples/fleet_frames.py --since yesterday --runner ray --address ray://HEAD:10001 --workers 64
 
-The question and the code are the same on a laptop (Daft's own runner, processes) and on a Ray cluster (``pip install
-'daft[ray]'``). A frame never comes to this process: workers send back two numbers for each. Sharpness is the variance of the
-Laplacian: blurred frames have little.
+The query and the code are the same on a laptop (Daft's own runner, processes) and on a Ray cluster (``pip install 'daft[ray]'``).
+Frames never reach this process: workers return two numbers for each. Sharpness is the variance of the Laplacian, which is small
+for
+blurred frames.
 """
 
 from __future__ import annotations
@@ -26,26 +27,26 @@ from shadowhound_data_logger.lake import decode, query
 from shadowhound_data_logger.lake.prefetch import Place, Prefetch
 from shadowhound_data_logger.lake.track import Object
 
-os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # otherwise Daft reports each run to its makers
+os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # otherwise Daft sends telemetry for each run
 os.environ.setdefault('DAFT_PROGRESS_BAR', '0')
 import daft  # isort: skip
 from daft import DataType, Series, col  # isort: skip
 
 THREADS = 8
 ROWS = 64
-"""Frames that a worker is handed at a time."""
-JUDGED = DataType.struct({'sharpness': DataType.float64(), 'brightness': DataType.float64()})
+"""Frames per batch of a worker."""
+RATING = DataType.struct({'sharpness': DataType.float64(), 'brightness': DataType.float64()})
 
 
-class Judge:
-    """Lives in a worker. It is told where the store is; the repr of that has no secret, so neither has a plan or a log."""
+class FrameRater:
+    """Runs in a worker. It gets the location of the store; its repr contains no secret, so plans and logs do not either."""
 
     def __init__(self, place: Place) -> None:
         self._place = place
 
-    @daft.method.batch(return_dtype=JUDGED, batch_size=ROWS)
-    def judge(self, bucket: Series, key: Series, size: Series, sha256: Series) -> list[dict[str, float | None]]:
-        """Of each frame; nulls for one that cannot be read any more."""
+    @daft.method.batch(return_dtype=RATING, batch_size=ROWS)
+    def rate(self, bucket: Series, key: Series, size: Series, sha256: Series) -> list[dict[str, float | None]]:
+        """The rating of each frame; nulls for one that can no longer be read."""
         columns = (each.to_pylist() for each in (bucket, key, size, sha256))
         objects = [Object(one, two, three, four or '') for one, two, three, four in zip(*columns, strict=True)]
         found = []
@@ -53,14 +54,14 @@ class Judge:
             prefetch.ahead(objects)
             for each in objects:
                 try:
-                    found.append(judged(decode.image(prefetch.get(each))))
+                    found.append(rated(decode.image(prefetch.get(each))))
                 except DataLoggerError:
                     found.append({'sharpness': None, 'brightness': None})
         return found
 
 
-def judged(pixels: Any) -> dict[str, float | None]:
-    """Sharpness and mean brightness of an image, by its green, which most of what the eye takes for light is."""
+def rated(pixels: Any) -> dict[str, float | None]:
+    """Sharpness and mean brightness of an image, by its green channel, which contributes most to perceived brightness."""
     gray = (pixels[..., 1] if pixels.ndim == 3 else pixels).astype(np.float32)
     inner = gray[1:-1, 1:-1]
     laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner
@@ -68,12 +69,12 @@ def judged(pixels: Any) -> dict[str, float | None]:
 
 
 def frames(place: Place, workers: int, least: float, **flags: Any) -> daft.DataFrame:
-    """A lazy frame: the rows of the sharp frames and how sharp they are, the sharpest first."""
-    judge = daft.cls(Judge, use_process=True, max_concurrency=workers)(place)
+    """A lazy frame: the rows of the sharp frames and their sharpness, the sharpest first."""
+    rate = daft.cls(FrameRater, use_process=True, max_concurrency=workers)(place)
     columns = ('robot', 'bucket', 'key', 't_start', 'x', 'y', 'bytes', 'sha256', 'content_type')
     rows = daft.from_arrow(query.objects(sensor='camera', columns=columns, **flags))
     told = rows.where(col('content_type').is_in(['image/jpeg', 'image/png'])).into_batches(ROWS)
-    made = told.with_column('judged', judge.judge(col('bucket'), col('key'), col('bytes'), col('sha256')))
+    made = told.with_column('judged', rate.rate(col('bucket'), col('key'), col('bytes'), col('sha256')))
     plain = made.select('robot', 'key', 't_start', 'x', 'y', col('judged').get('sharpness').alias('sharpness'),
                         col('judged').get('brightness').alias('brightness'))  # fmt: skip
     return plain.where(col('sharpness') >= least).sort('sharpness', desc=True)
@@ -90,9 +91,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = ('robot', 'since', 'until', 'near', 'mission_type', 'where')
     flags = {name: getattr(options, name) for name in names if getattr(options, name)}
     try:
-        begun = time.perf_counter()
+        began = time.perf_counter()
         found = frames(place, options.workers, options.least, **flags).to_pydict()
-        took = time.perf_counter() - begun
+        took = time.perf_counter() - began
     except DataLoggerError as error:
         print(f'fleet_frames: {error}', file=sys.stderr)
         return 1
@@ -125,4 +126,6 @@ def _parser() -> argparse.ArgumentParser:
 if __name__ == '__main__':
     code = main()
     sys.stdout.flush()
-    os._exit(code)  # Daft's threads outlive its workers: once in a while the interpreter's own end met them and crashed
+    os._exit(
+        code
+    )  # Daft's threads keep running after its workers: the interpreter's shutdown occasionally crashed because of them

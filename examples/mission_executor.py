@@ -1,11 +1,14 @@
-"""The integration guide's MissionExecutor, working: a mission agent that logs what it does, in plain Python without ROS.
+"""The integration guide's MissionExecutor, working: a mission agent that logs its actions, in plain Python without ROS.
 
     scripts/with-env python examples/mission_executor.py [--seconds 20] [COMMAND]
 
-No robot is needed, and none is asked: what this agent logs (pose, battery, temperature, camera) comes from the simulated Go2's
-world in this very process. Beside ``sim_go2_node`` and ``sensor_logger_node`` with the same SHADOWHOUND_HOME, the node joins the
-mission with what it measures on the topics itself. Data go where the environment says (MLFLOW_TRACKING_URI, AWS_ENDPOINT_URL),
-else below ``~/.shadowhound``. On a robot, replace SimulatedRobot by the real one: what MissionExecutor asks of it stays the same.
+No robot is needed: the logged data (pose, battery, temperature, camera) is from the simulated Go2's world in this process. Next
+to
+``sim_go2_node`` and ``sensor_logger_node`` with the same SHADOWHOUND_HOME, the node joins the mission with its own measurements.
+Data
+is stored where the environment says (MLFLOW_TRACKING_URI, AWS_ENDPOINT_URL), otherwise below ``~/.shadowhound``. On a robot,
+replace
+SimulatedRobot by the real one, with the same methods.
 """
 
 from __future__ import annotations
@@ -30,12 +33,12 @@ from shadowhound_data_logger import MissionDataLogger
 
 PERIOD_S: Final = 0.2
 FRAME_EVERY: Final = 5
-"""Periods from one camera frame to the next."""
+"""Periods between camera frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """What a robot says of itself; percent, degrees Celsius, meters, radians."""
+    """The state reported by a robot; percent, degrees Celsius, meters, radians."""
 
     battery_percentage: float
     temperature: float
@@ -45,7 +48,7 @@ class RobotState:
 
 
 class SimulatedRobot:
-    """The simulated Go2 on its patrol, from now on."""
+    """The simulated Go2 on its patrol, starting now."""
 
     def __init__(self, seed: int = 1) -> None:
         self._world = World.of(seed)
@@ -84,7 +87,7 @@ class MissionExecutor:
         self._poses: list[Pose] = []
 
     def execute_mission(self, command: str) -> str:
-        """Walk, log, and say which run it is; what is raised on the way ends the mission as FAILED."""
+        """Walk, log, and return the run; an exception ends the mission as FAILED."""
         mission_type = self._infer_mission_type(command)
         run_id = self.data_logger.start_mission(mission_type, command)
         began_s = time.monotonic()
@@ -93,7 +96,7 @@ class MissionExecutor:
             with tempfile.TemporaryDirectory() as folder:
                 trajectory_path = Path(folder) / 'trajectory.csv'
                 self._save_trajectory_csv(trajectory_path)
-                self.data_logger.log_trajectory(trajectory_path)  # it is copied: the file may go
+                self.data_logger.log_trajectory(trajectory_path)  # it is copied: the file may be deleted
             self.data_logger.end_mission(
                 success=True, distance_m=self._calculate_distance_traveled(), duration_s=time.monotonic() - began_s
             )
@@ -103,7 +106,7 @@ class MissionExecutor:
         return run_id
 
     def _walk(self, began_s: float) -> None:
-        """Where an agent would act; here the robot walks by itself, and what it says is logged."""
+        """A real agent would act here; this robot walks on its own, and its state is logged."""
         step = 0
         while time.monotonic() - began_s < self._seconds:
             state = self.robot.get_state()

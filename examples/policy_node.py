@@ -3,14 +3,16 @@
 
     python examples/policy_node.py --ros-args -p max_speed:=0.6 -p max_turn:=1.0
 
-At each step, as often as the manifest says (``fps``), it takes the newest message at or before now, as the export does, and
-never one that is older than ``max_age_s``. Speeds and their changes are limited, and whatever goes wrong (no fresh odometry, a
-model that fails or gives no numbers, no policy) makes the robot stand: it is told zero until things are well again. Where this
-program dies or hangs nobody tells it anything: the robot's driver has to stop it then, as the simulated one does after half a
-second. Each step's latency and failures are reported; a policy that breaks the limits of its manifest is rolled back, and the
-version before drives from the next step on.
+At each step, at the rate in the manifest (``fps``), it takes the newest message at or before now, as the export does, and never
+one
+older than ``max_age_s``. Speeds and their changes are limited, and any failure (no fresh odometry, a model that fails or returns
+no
+numbers, no policy) stops the robot: it publishes zero until the problem is gone. If this program exits or hangs, nothing is
+published: the robot's driver must then stop it, as the simulated one does after half a second. Latency and failures of each step
+are
+reported; a policy that violates the limits in its manifest is rolled back, and the version before runs from the next step on.
 
-``observation.state`` may consist of what ``export --state pose,twist`` makes of odometry; a policy that wants more is refused.
+``observation.state`` may contain what ``export --state pose,twist`` makes of odometry; a policy that needs more is rejected.
 """
 
 from __future__ import annotations
@@ -48,13 +50,13 @@ FIELDS: Final[Mapping[str, str]] = {
 
 
 class Steps:
-    """One policy, as a function of odometry. Raises PolicyError for one that this program cannot drive with."""
+    """One policy, as a function of odometry. Raises PolicyError for a policy that this program cannot run."""
 
     def __init__(self, policy: ActivePolicy) -> None:
         inputs = {one.name: one for one in policy.manifest.inputs}
         outputs = {one.name: one for one in policy.manifest.outputs}
         if inputs.keys() != {STATE} or not set(inputs[STATE].names) <= FIELDS.keys():
-            raise PolicyError(f'{policy.id} wants more than the pose and the twist of odometry')
+            raise PolicyError(f'{policy.id} needs more than the pose and the twist of odometry')
         if ACTION not in outputs or outputs[ACTION].names != COMMAND.names:
             raise PolicyError(f'{policy.id} gives no {" ".join(COMMAND.names)}')
         self._state, self._shape = inputs[STATE], outputs[ACTION].shape
@@ -63,7 +65,7 @@ class Steps:
         self._session = onnxruntime.InferenceSession(str(policy.model), options, providers=['CPUExecutionProvider'])
 
     def __call__(self, odometry: Odometry) -> NDArray[np.float64]:
-        """x, y (m/s) and yaw rate (rad/s) that the policy wants, in the frame of the body. Raises ValueError without numbers."""
+        """x, y (m/s) and yaw rate (rad/s) in the frame of the body. Raises ValueError if the policy returns no numbers."""
         values = [reduce(getattr, FIELDS[name].split('.'), odometry) for name in self._state.names]
         given = np.array(values, self._state.dtype).reshape(self._state.shape)
         (wanted,) = self._session.run([ACTION], {STATE: given})
@@ -82,9 +84,9 @@ class PolicyNode(Node):
         self.max_change, self.max_age_s = self._number('max_change', 2.0), self._number('max_age_s', 0.5)
         self._odometry: Odometry | None = None
         self._arrived_s = 0.0
-        self._told = np.zeros(3)
+        self._last_command = np.zeros(3)
         self._commands = self.create_publisher(Twist, 'cmd_vel', 1)
-        self.create_subscription(Odometry, 'odom', self._heard, qos_profile_sensor_data)
+        self.create_subscription(Odometry, 'odom', self._on_odometry, qos_profile_sensor_data)
 
     def _number(self, name: str, default: float) -> float:
         value = float(self.declare_parameter(name, default).value)
@@ -92,11 +94,11 @@ class PolicyNode(Node):
             raise SystemExit(f'{name} = {value} is refused: a number from 0')
         return value
 
-    def _heard(self, message: Odometry) -> None:
+    def _on_odometry(self, message: Odometry) -> None:
         self._odometry, self._arrived_s = message, time.monotonic()
 
     def drive(self, policy: ActivePolicy, is_stopped: Callable[[], bool]) -> None:
-        """Until another policy is active, this one broke its limits, or somebody stops it."""
+        """Run until another policy is active, this one violates its limits, or the node is stopped."""
         try:
             steps = Steps(policy)
         except PolicyError:
@@ -110,7 +112,7 @@ class PolicyNode(Node):
         due = time.monotonic()
         while not is_stopped() and policy.is_current():
             due = max(due + period_s, time.monotonic())
-            rclpy.spin_once(self, timeout_sec=0.0)  # also where a step took longer than its period
+            rclpy.spin_once(self, timeout_sec=0.0)  # also if a step took longer than its period
             while (left := due - time.monotonic()) > 0:
                 rclpy.spin_once(self, timeout_sec=left)
             if not self._step(policy, steps, period_s):
@@ -119,21 +121,21 @@ class PolicyNode(Node):
 
     def _step(self, policy: ActivePolicy, steps: Steps, period_s: float) -> bool:
         odometry = self._fresh()
-        if odometry is None:  # nothing that the policy could be blamed for
-            self.tell(np.zeros(3), period_s)
+        if odometry is None:  # not the policy's fault
+            self.publish_command(np.zeros(3), period_s)
             return True
         began = time.perf_counter()
         try:
             wanted = steps(odometry)
         except Exception as error:  # noqa: BLE001 - whatever a model does, the robot stands
             self.get_logger().warning(f'a step failed: {error}', throttle_duration_sec=5.0)
-            self.tell(np.zeros(3), period_s)
+            self.publish_command(np.zeros(3), period_s)
             return policy.report(time.perf_counter() - began, failed=True)
-        self.tell(wanted, period_s)
+        self.publish_command(wanted, period_s)
         return policy.report(time.perf_counter() - began)
 
     def _fresh(self) -> Odometry | None:
-        """The newest message, unless it is too old, both by its stamp and by when it came: a stamp may be wrong, or ahead."""
+        """The newest message, unless it is too old, both by its stamp and by its arrival: a stamp may be wrong, or ahead."""
         if self._odometry is None:
             return None
         stamp = self._odometry.header.stamp
@@ -141,21 +143,21 @@ class PolicyNode(Node):
         is_fresh = abs(age_s) <= self.max_age_s and time.monotonic() - self._arrived_s <= self.max_age_s
         return self._odometry if is_fresh else None
 
-    def tell(self, wanted: NDArray[np.float64], period_s: float) -> None:
-        """Within the limits: of speed, of turning, and of how fast either may change. Zero is told at once."""
+    def publish_command(self, wanted: NDArray[np.float64], period_s: float) -> None:
+        """Apply the limits of speed, of turning, and of their changes. Zero is published immediately."""
         top = np.array([self.max_speed, self.max_speed, self.max_turn])
         limited = np.clip(wanted, -top, top)
         if limited.any():
             change = self.max_change * period_s
-            limited = np.clip(limited, self._told - change, self._told + change)
-        self._told = limited
+            limited = np.clip(limited, self._last_command - change, self._last_command + change)
+        self._last_command = limited
         command = Twist()
         command.linear.x, command.linear.y, command.angular.z = map(float, limited)
         self._commands.publish(command)
 
 
 def main() -> int:
-    """Until Ctrl-C."""
+    """Run until Ctrl-C."""
     rclpy.init()
     node = PolicyNode()
     try:
@@ -166,7 +168,7 @@ def main() -> int:
                     node.drive(policy, lambda: not rclpy.ok())
             except (PolicyError, OSError) as error:
                 node.get_logger().warning(f'no policy drives: {error}', throttle_duration_sec=30.0)
-                node.tell(np.zeros(3), 1.0)
+                node.publish_command(np.zeros(3), 1.0)
                 rclpy.spin_once(node, timeout_sec=1.0)
     except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         pass

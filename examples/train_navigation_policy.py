@@ -1,15 +1,17 @@
-"""The integration guide's training script: a small network learns from camera frames how the robot went on.
+"""The integration guide's training script: a small network learns the robot's motion from camera frames.
 
     pip install '.[lake,train]'
     python examples/train_navigation_policy.py --mission-type patrol --since yesterday --epochs 5
 
-Frames come from the store that AWS_ENDPOINT_URL names (or from ``--folder``, what ``shadowhound-data fetch --to`` brought), the
-run goes to MLFLOW_TRACKING_URI: parameters, losses, the best checkpoint. What is learnt is speed (m/s) and yaw rate (rad/s)
-from one frame to the next, by the catalog's poses. The last fifth in the order of time is for validation: neighbors look
-alike.
+Frames are read from the store that AWS_ENDPOINT_URL names (or from ``--folder``, the output of ``shadowhound-data fetch --to``),
+the
+run is logged to MLFLOW_TRACKING_URI: parameters, losses, the best checkpoint. The targets are speed (m/s) and yaw rate (rad/s)
+from
+one frame to the next, from the catalog's poses. The last fifth in order of time is for validation, because neighboring frames are
+similar.
 
-With ``--export DIR`` it learns from a training set of ``shadowhound-data export lerobot`` instead: the action of each frame. Then
-the missions that are marked as validation are held back, and the run is marked with the digest of the dataset, by which
+With ``--export DIR`` it learns from a training set of ``shadowhound-data export lerobot`` instead: the action of each frame. The
+missions that are marked as validation are then held out, and the run is tagged with the digest of the dataset, so that
 ``shadowhound-data export where`` finds it.
 """
 
@@ -36,9 +38,9 @@ from shadowhound_data_logger.lake import MissionDataset, log_dataset
 
 EXPERIMENT = 'navigation_policy_training'
 SIZE = (96, 128)
-"""Height and width of what the network sees."""
+"""Height and width of the network's input."""
 GAP_S = 2.5
-"""Frames that are farther apart have nothing to do with each other."""
+"""Frames that are farther apart are not consecutive."""
 LARGEST = (3.0, 3.0)
 """m/s and rad/s beyond which a pose has jumped."""
 HELD_BACK = 0.2
@@ -63,7 +65,7 @@ class Policy(nn.Module):
 
 
 def motions(stamps_ns: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """(n, 2): speed ahead and yaw rate from each frame to the next; NaN where there is none or it is not a neighbor."""
+    """(n, 2): forward speed and yaw rate from each frame to the next; NaN if there is no next frame or it is not consecutive."""
     found = np.full((len(poses), 2), np.nan)
     if len(poses) < 2:
         return found
@@ -79,7 +81,7 @@ def motions(stamps_ns: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 class Frames(Protocol):
-    """Pictures by number."""
+    """Images by index."""
 
     def __getitems__(self, indices: Sequence[int]) -> Sequence[Mapping[str, Any]]: ...
 
@@ -111,7 +113,7 @@ class ExportedFrames:
         return [{'image': self.images[index]} for index in indices]
 
     def split(self) -> tuple[np.ndarray, np.ndarray]:
-        """By mission; where none is marked, the last fifth of the frames."""
+        """By mission; if none is marked, the last fifth of the frames."""
         numbers = np.arange(len(self))
         if self.held_back.any():
             return numbers[~self.held_back], numbers[self.held_back]
@@ -119,7 +121,7 @@ class ExportedFrames:
 
 
 class Motions(Dataset[tuple[np.ndarray, np.ndarray]]):
-    """Frames by number, and how the robot went on, in standard deviations from the mean."""
+    """Frames by index, and the following motion, in standard deviations from the mean."""
 
     def __init__(self, frames: Frames, labels: np.ndarray, numbers: np.ndarray, scale: tuple[np.ndarray, np.ndarray]) -> None:
         self.frames, self.numbers = frames, numbers
@@ -132,14 +134,14 @@ class Motions(Dataset[tuple[np.ndarray, np.ndarray]]):
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """A batch at once: its objects are fetched side by side."""
+        """A complete batch: its objects are fetched in parallel."""
         numbers = [int(self.numbers[index]) for index in indices]
         found = self.frames.__getitems__(numbers)
         return [(sample['image'], self.labels[number]) for sample, number in zip(found, numbers, strict=True)]
 
 
 def split(labels: np.ndarray, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers of the frames to learn from and of those held back, the latest."""
+    """The indices of the frames for training and of those held out, the latest."""
     known = np.flatnonzero(~np.isnan(labels).any(axis=1))
     known = known[np.argsort(stamps_ns[known], kind='stable')]
     border = len(known) - max(1, round(HELD_BACK * len(known)))
@@ -147,7 +149,7 @@ def split(labels: np.ndarray, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def epoch(policy: Policy, batches: DataLoader[Any], optimizer: torch.optim.Optimizer | None) -> float:
-    """The mean loss; without an optimizer nothing is learnt."""
+    """The mean loss; without an optimizer nothing is learned."""
     policy.train(optimizer is not None)
     total, count = 0.0, 0
     with torch.set_grad_enabled(optimizer is not None):
@@ -164,15 +166,15 @@ def epoch(policy: Policy, batches: DataLoader[Any], optimizer: torch.optim.Optim
 def train(
     policy: Policy, learn: Motions, check: Motions, options: argparse.Namespace, folder: Path
 ) -> Iterator[Mapping[str, float]]:
-    """The figures of each epoch; the best checkpoint lies in ``folder``."""
+    """The metrics of each epoch; the best checkpoint is in ``folder``."""
     how: dict[str, Any] = {'batch_size': options.batch, 'num_workers': options.workers, 'persistent_workers': options.workers > 0}
     batches, checks = DataLoader(learn, shuffle=True, **how), DataLoader(check, **how)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=options.rate, weight_decay=1e-3)
     best = math.inf
     for number in range(options.epochs):
-        begun = time.perf_counter()
+        began = time.perf_counter()
         trained = epoch(policy, batches, optimizer)
-        seconds = time.perf_counter() - begun
+        seconds = time.perf_counter() - began
         validated = epoch(policy, checks, None)
         if validated < best:
             best = validated
@@ -217,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             mlflow.log_metrics({name: value for name, value in figures.items() if name != 'epoch'}, step=int(figures['epoch']))
             print('  '.join(f'{name} {value:.4g}' for name, value in figures.items()), flush=True)
         mlflow.log_artifact(str(Path(folder) / 'policy.pth'), artifact_path='checkpoints')
-        print(f'{len(learn)} frames learnt from, {len(check)} to check; run {run.info.run_id} in {EXPERIMENT}')
+        print(f'{len(learn)} frames for training, {len(check)} to check; run {run.info.run_id} in {EXPERIMENT}')
     return 0
 
 

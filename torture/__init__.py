@@ -1,6 +1,6 @@
 """Campaigns that try to make the logger lose data: ``python -m torture.kills``, each with ``--seed``, ``--short`` and ``--json``.
 
-They drive the real programs with the means of the tests, which therefore stand on the path.
+They run the real programs with the helpers of the tests, which are therefore on the path.
 """
 
 from __future__ import annotations

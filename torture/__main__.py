@@ -1,4 +1,4 @@
-"""Runs every campaign of this folder one after the other, each in a process of its own; exit code 1 when one found something."""
+"""Runs every campaign of this folder one after the other, each in a separate process; exit code 1 if one found a problem."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the campaigns' command lines share: their options, how a verdict is told, and the exit code."""
+"""Shared by the campaigns' command lines: options, verdict and exit code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One thing that must hold, and what was found."""
+    """One requirement, and what was found."""
 
     what: str
     holds: bool
@@ -25,31 +25,33 @@ class Bar:
 
 
 def some(lines: Sequence[str]) -> str:
-    """How many, and the first of them; nothing where there are none."""
+    """The number of lines, and the first of them; empty if there are none."""
     return f'{len(lines)}: ' + '; '.join(lines[:30]) if lines else ''
 
 
 @dataclass(slots=True)
 class Workshop:
-    """Where a campaign works."""
+    """The folder of a campaign."""
 
     folder: Path
     passed: bool = False
 
 
 def parser(module: str, description: str) -> argparse.ArgumentParser:
-    """With the options that every campaign has; ``seed`` is a new one each time unless it is given."""
+    """With the options of every campaign; ``seed`` is random unless given."""
     made = argparse.ArgumentParser(prog=f'python -m torture.{module}', description=description)
     made.add_argument('--seed', type=int, default=random.SystemRandom().randrange(1 << 31), help='of all that is random')
-    made.add_argument('--short', action='store_true', help='the same in little, for every day')
+    made.add_argument('--short', action='store_true', help='a short version, for every day')
     made.add_argument('--json', action='store_true', help='print the figures as one line of JSON')
-    made.add_argument('--folder', type=Path, help='where to leave data and logs; else they go, unless something was found')
+    made.add_argument(
+        '--folder', type=Path, help='where to keep data and logs; otherwise they are deleted, unless a problem was found'
+    )
     return made
 
 
-def asked_kills(options: argparse.ArgumentParser, argv: Sequence[str] | None, *, usual: int, short: int) -> argparse.Namespace:
-    """What the command line of a campaign of kills asks for, told to whoever watches."""
-    options.add_argument('--kills', type=int, default=0, help=f'how many, {usual} unless told')
+def parse_kills(options: argparse.ArgumentParser, argv: Sequence[str] | None, *, usual: int, short: int) -> argparse.Namespace:
+    """Parse the command line of a campaign of kills, and print it."""
+    options.add_argument('--kills', type=int, default=0, help=f'how many (default {usual})')
     given = options.parse_args(argv)
     given.kills = given.kills or (short if given.short else usual)
     progress(f'{given.kills} kills, seed {given.seed}')
@@ -58,7 +60,7 @@ def asked_kills(options: argparse.ArgumentParser, argv: Sequence[str] | None, *,
 
 @contextmanager
 def workshop(given: argparse.Namespace) -> Iterator[Workshop]:
-    """A folder for data and logs, which goes when ``passed`` was set and no other place was asked for."""
+    """A folder for data and logs, deleted if ``passed`` was set and no folder was given."""
     shop = Workshop(given.folder or Path(tempfile.mkdtemp(prefix='torture-')))
     shop.folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -71,16 +73,16 @@ def workshop(given: argparse.Namespace) -> Iterator[Workshop]:
 
 
 def progress(text: str) -> None:
-    """A line for whoever watches."""
+    """Print a line of progress."""
     print(text, file=sys.stderr, flush=True)
 
 
 def verdict(figures: Mapping[str, Any], bars: Sequence[Bar], *, as_json: bool) -> int:
-    """Print bars (and with JSON the figures); the exit code: 0 when every bar holds, else 1."""
+    """Print bars (and with JSON the results); returns the exit code: 0 if every bar is met, otherwise 1."""
     passed = all(bar.holds for bar in bars)
     if as_json:
-        said = [{'what': bar.what, 'holds': bar.holds, 'found': bar.found} for bar in bars]
-        print(json.dumps({**figures, 'bars': said, 'passed': passed}))
+        reported = [{'what': bar.what, 'holds': bar.holds, 'found': bar.found} for bar in bars]
+        print(json.dumps({**figures, 'bars': reported, 'passed': passed}))
     else:
         for bar in bars:
             print(f'{"ok  " if bar.holds else "FAIL"}  {bar.what}{": " if bar.found else ""}{bar.found}')

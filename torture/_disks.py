@@ -1,4 +1,4 @@
-"""Small file systems to fill up or to break: ext4 in a file where the machine allows it, else memory."""
+"""Small file systems to fill up or to break: ext4 in a file if the machine allows it, otherwise memory."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import Final
 MEBI: Final = 1 << 20
 ERRORS: Final = Path('/sys/fs/ext4')
 INSIDE: Final = 'SHADOWHOUND_TORTURE_INSIDE'
-"""Set in a process that has already been given a namespace of its own."""
+"""Set in a process that already runs in a separate namespace."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disk:
-    """A mounted file system of its own."""
+    """A separate mounted file system."""
 
     path: Path
     kind: str
@@ -27,29 +27,29 @@ class Disk:
     image: Path
 
     def free(self) -> int:
-        """Bytes that a writer may still use."""
+        """Bytes that are left for a writer."""
         status = os.statvfs(self.path)
         return status.f_bavail * status.f_frsize
 
     def break_down(self) -> None:
-        """Let the kernel find an error, upon which ext4 is read-only until it is unmounted and checked."""
+        """Make the kernel find an error: ext4 is then read-only until it is unmounted and checked."""
         answer = subprocess.run(['findmnt', '-no', 'SOURCE', str(self.path)], check=True, capture_output=True, text=True)
         (ERRORS / Path(answer.stdout.strip()).name / 'trigger_fs_error').write_text('1')
 
     def repair(self) -> None:
-        """Unmount, check and mount again; nobody may use it meanwhile."""
+        """Unmount, check and mount again; it must not be in use."""
         _run('umount', str(self.path))
-        subprocess.run(['e2fsck', '-fy', str(self.image)], check=False, capture_output=True)  # 1: errors were mended
+        subprocess.run(['e2fsck', '-fy', str(self.image)], check=False, capture_output=True)  # 1: errors were fixed
         _mount_image(self.image, self.path)
 
 
 class NotAllowed(Exception):
-    """This process may not mount anything."""
+    """This process may not mount file systems."""
 
 
 @contextmanager
 def small_disk(folder: Path, mebibytes: int) -> Iterator[Disk]:
-    """Raises NotAllowed. Unmounted at the end, whatever still uses it."""
+    """Raises NotAllowed. Unmounted at the end, even if it is in use."""
     disk = Disk(folder / 'disk', 'ext4', folder / 'disk.img')
     disk.path.mkdir(parents=True)
     try:
@@ -71,7 +71,7 @@ def small_disk(folder: Path, mebibytes: int) -> Iterator[Disk]:
 
 
 def inside(module: str, arguments: list[str]) -> None:
-    """Become the same program in a namespace where an ordinary user may mount; returns where that is no use or was done."""
+    """Restart the program in a namespace where an ordinary user may mount; returns if that is useless or already done."""
     if INSIDE not in os.environ:
         command = ['unshare', '--user', '--map-root-user', '--mount', sys.executable, '-m', module, *arguments]
         os.execvpe(command[0], command, {**os.environ, INSIDE: '1'})  # noqa: S606 - its own program and arguments

@@ -1,4 +1,4 @@
-"""Program of long_outage.py: delivers a spool as the node does while new objects go on arriving, and tells how it goes.
+"""Program of long_outage.py: uploads a spool as the node does while new objects keep arriving, and reports its progress.
 
 ``python -m torture._drainer HOME LOG`` with the environment that names the store. Each line on standard output is
 ``{"s": seconds, "rss_mb": ..., "delivered": ...}``; the file LOG gets a line for each object, in the order of delivery.
@@ -50,8 +50,8 @@ class Noting:
         return answer
 
 
-def go_on(spool: Spool, writer: SpoolWriter, stop: threading.Event) -> None:
-    """The profile, as time passes."""
+def spool_profile(spool: Spool, writer: SpoolWriter, stop: threading.Event) -> None:
+    """Spool the objects of the profile in real time."""
     began, number = time.monotonic(), itertools.count()
     for moment, sensor in arrivals(24 * 3600.0):
         if stop.wait(max(0.0, began + moment - time.monotonic())):
@@ -76,7 +76,7 @@ def main(home: str, log_path: str) -> None:
         writer = SpoolWriter(spool)
         uploader = Uploader(spool, Noting(store, log), upload, writer.settle)
         writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
-        live = threading.Thread(target=go_on, args=(spool, writer, stop))
+        live = threading.Thread(target=spool_profile, args=(spool, writer, stop))
         began = time.monotonic()
         writer.open()
         uploader.open()

@@ -1,6 +1,6 @@
-"""Judges a run of kills: what was published (by a witness), what the store holds, and what the ledger says of both.
+"""Audits a run of kills: what was published (by a witness), what the store has, and the ledger.
 
-Nothing here asks the code under test but for the rows of its index and its ledger; contents are read by other libraries.
+From the code under test it only uses the rows of its index and its ledger; contents are read by other libraries.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ HEADERLESS: Final = frozenset({'/imu', '/go2_states', '/lowstate'})
 BEST_EFFORT: Final = (CLOUDS, CALIBRATION)
 """The witness may miss some of these."""
 WHOLE: Final = tuple(topic for topic in TYPES if topic != CALIBRATION)
-"""Topics of which every message is stored; the calibration is stored when it changes."""
+"""Topics whose messages are all stored; the calibration is stored when it changes."""
 READERS: Final = 4
 LOSS_S: Final = 1.25
-"""What a kill may cost of what had been received: a batch of one second and the commit window."""
+"""Maximum loss per kill of received messages: a batch of one second and the commit window."""
 SLACK_S: Final = 0.15
 """Two polls for a batch to be closed, and the commit itself."""
 DISCOVERY_S: Final = 3.0
-"""Until a node that listens has been found by the publishers, on a busy machine."""
+"""Time for the publishers to discover a new node on a busy machine."""
 
 
 class Kill(NamedTuple):
-    """When a node was killed, and when the one after it listened (infinite if it never came to that), s since 1970."""
+    """When a node was killed, and when the next one listened (infinite if it never did), s since 1970."""
 
     at: float
     ready: float
 
 
 class Gap(NamedTuple):
-    """Messages in a row that are not stored: how many of them before and after the kill, and the times around it, s."""
+    """Consecutive messages that are not stored: their number before and after the kill, and the surrounding times, s."""
 
     before: int
     away: int
@@ -65,7 +65,7 @@ class Gap(NamedTuple):
 
 @dataclass(slots=True)
 class Audit:
-    """What was found; ``wrong`` has one sentence for each thing that must not be."""
+    """The result; ``wrong`` has one sentence per problem."""
 
     wrong: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     objects: int = 0
@@ -78,7 +78,7 @@ class Audit:
         return [Bar(f'0 {what}', not self.wrong[what], some(self.wrong[what])) for what in whats]
 
     def losses(self) -> dict[str, dict[str, float]]:
-        """By topic, over all gaps: samples and milliseconds, median and worst."""
+        """By topic, over all gaps: samples and milliseconds, median and maximum."""
         table: dict[str, dict[str, float]] = {}
         for topic, gaps in self.gaps.items():
             figures: dict[str, Sequence[float]] = {
@@ -96,12 +96,12 @@ class Audit:
 
 
 class Heard:
-    """What the witness heard: topic -> stamp (the header's, else the time of sending) -> message."""
+    """What the witness received: topic -> stamp (the header's, otherwise the time of sending) -> message."""
 
     def __init__(self, recording: Path) -> None:
         self.sent_ns: dict[str, dict[int, int]] = defaultdict(dict)
         self.messages: dict[str, dict[int, bytes]] = defaultdict(dict)
-        """Serialized; of the large ones the SHA-256 of their data."""
+        """Serialized; for large ones the SHA-256 of their data."""
         for topic, source_ns, cdr in recorded(recording):
             sec, nanosec = struct.unpack_from('<iI', cdr, 4)
             stamp = source_ns if topic in HEADERLESS else sec * SECOND + nanosec
@@ -110,19 +110,19 @@ class Heard:
             self.messages[topic][stamp] = _digest(bytes(decode(TYPES[topic], cdr).data)) if large else cdr
 
 
-def audit(heard: Heard, said: Mapping[str, int], ledger: Mapping[str, Any], index: Path, store: ObjectStore,
+def audit(heard: Heard, reported: Mapping[str, int], ledger: Mapping[str, Any], index: Path, store: ObjectStore,
           robot: str, kills: Sequence[Kill]) -> Audit:  # fmt: skip
-    """All of it; ``said`` is what the robot counted itself, ``ledger`` the one at the end."""
+    """The complete audit; ``reported`` are the robot's own counts, ``ledger`` the final one."""
     found = Audit()
     stored = _objects(found, heard, index, store, robot)
-    _accounts(found, heard, said, ledger, stored)
+    _accounts(found, heard, reported, ledger, stored)
     for topic in WHOLE:
         found.gaps[topic] = _gaps(found, topic, heard.sent_ns[topic], stored[topic], kills)
     return found
 
 
 def _objects(found: Audit, heard: Heard, index: Path, store: ObjectStore, robot: str) -> dict[str, set[int]]:
-    """Compare every object of the store with its row and with what was published; the stored stamps by topic."""
+    """Compare every object of the store with its row and with what was published; returns the stored stamps by topic."""
     with sqlite3.connect(index) as db:
         columns = 'key, state, sha256, topic, t_start_ns, samples'
         rows = {row[0]: row[1:] for row in db.execute(f'SELECT {columns} FROM objects')}  # noqa: S608 - own constants
@@ -151,7 +151,7 @@ def _objects(found: Audit, heard: Heard, index: Path, store: ObjectStore, robot:
 
 
 def _compare(found: Audit, key: str, topic: str, body: bytes, start_ns: int, heard: Heard) -> list[int]:
-    """The stamps of an object's samples; each must be what the witness heard under it."""
+    """The stamps of an object's samples; each must match what the witness received with it."""
     stamps = [start_ns]
     if topic in BEST_EFFORT and start_ns not in heard.messages[topic]:
         return stamps
@@ -177,15 +177,15 @@ def _compare(found: Audit, key: str, topic: str, body: bytes, start_ns: int, hea
 
 
 def _reads(topic: str | None, body: bytes) -> bool:
-    """Whether the content is a whole object, though another one than was spooled."""
+    """Whether the content is a complete object, though not the one that was spooled."""
     ends: dict[str | None, Callable[[], bool]] = {CAMERA: lambda: body.endswith(b'\xff\xd9'), CLOUDS: lambda: bool(body)}
     return ends.get(topic, lambda: body.rstrip().endswith(b'}'))()
 
 
 def _accounts(
-    found: Audit, heard: Heard, said: Mapping[str, int], ledger: Mapping[str, Any], stored: Mapping[str, set[int]]
+    found: Audit, heard: Heard, reported: Mapping[str, int], ledger: Mapping[str, Any], stored: Mapping[str, set[int]]
 ) -> None:
-    """Published, stored and lost are the same numbers for robot, store and ledger, and for the witness where it can hear all."""
+    """Robot, store and ledger must agree on published, stored and lost messages; so must a witness that can receive all."""
     unaccounted = found.wrong['unaccounted']
     for topic in TYPES:
         row = ledger['topics'].get(topic)
@@ -194,19 +194,19 @@ def _accounts(
             continue
         lost, kept = (row['missed'] or 0) + sum(row['dropped'].values()), len(stored.get(topic, ()))
         pairs = {
-            'robot and ledger': (said[topic], row['published']), 'store and ledger': (kept, row['stored']),
-            'robot and all outcomes': (said[topic], kept + lost + row['skipped']),
+            'robot and ledger': (reported[topic], row['published']), 'store and ledger': (kept, row['stored']),
+            'robot and all outcomes': (reported[topic], kept + lost + row['skipped']),
             'open': (row['open'], 0), 'rejected': (sum(row['rejected'].values()), 0),
         }  # fmt: skip
         if topic not in BEST_EFFORT:
-            pairs['robot and witness'] = said[topic], len(heard.sent_ns[topic])
+            pairs['robot and witness'] = reported[topic], len(heard.sent_ns[topic])
         unaccounted += [f'{topic}, {what}: {one} and {other}' for what, (one, other) in pairs.items() if one != other]
         if causes := (set(row['missed_by']) | set(row['dropped'])) - {'restart'}:
             found.wrong['lost without a kill'].append(f'{topic}: {causes}')
 
 
 def _gaps(found: Audit, topic: str, sent_ns: Mapping[int, int], stored: set[int], kills: Sequence[Kill]) -> list[Gap]:
-    """Each run of messages that are not stored belongs to a kill, or to several that followed each other closely."""
+    """Each run of messages that are not stored must belong to a kill, or to several in close succession."""
     times = sorted(sent / SECOND for sent in sent_ns.values())
     kept = sorted(sent_ns[stamp] / SECOND for stamp in stored if stamp in sent_ns)
     gaps: list[Gap] = []
@@ -215,7 +215,7 @@ def _gaps(found: Audit, topic: str, sent_ns: Mapping[int, int], stored: set[int]
         first, place = place, bisect_left(times, end, place)
         if first < place:
             inside = [kill for kill in kills if start <= kill.at <= end]
-            # One encoder may be killed over a message while the next one, of another encoder, is durable already.
+            # An encoder may be killed with a message while the next message, of another encoder, is durable already.
             inside = inside or [kill for kill in kills if end < kill.at <= end + LOSS_S + SLACK_S][:1]
             if inside:
                 gaps.append(_gap(found.wrong['lost beyond the bar'], topic, times[first:place], end, inside))
@@ -226,7 +226,7 @@ def _gaps(found: Audit, topic: str, sent_ns: Mapping[int, int], stored: set[int]
 
 
 def _gap(beyond: list[str], topic: str, lost: Sequence[float], end: float, kills: Sequence[Kill]) -> Gap:
-    """The gap of these kills; of the nodes that came up between them nothing is stored."""
+    """The gap of these kills; of the nodes started between them nothing is stored."""
     before, first, last = bisect_right(lost, kills[0].at), kills[0], kills[-1]
     gap = Gap(before, len(lost) - before, max(first.at - lost[0], 0.0), max(min(end, lost[-1]) - first.at, 0.0))
     if gap.before_s > LOSS_S + SLACK_S:

@@ -1,4 +1,4 @@
-"""Objects of the default profile, as large as those of the simulated robot, without ROS."""
+"""Objects of the default profile, of the simulated robot's sizes, without ROS."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.spool.spool import Spool
 
 LIVE: Final = 'live-'
-"""In the keys of what is made while a backlog is delivered."""
+"""Part of the keys of objects made while a backlog is uploaded."""
 SIZES: Final = {
     'camera': 38_000, 'lidar': 311_000, 'imu': 25_000, 'odom': 400, 'states': 9_000, 'joints': 25_000, 'lowstate': 22_000,
 }  # fmt: skip
-"""Bytes an object, measured with ``sim_go2_node``."""
+"""Bytes per object, measured with ``sim_go2_node``."""
 PERIODS_S: Final = {name: 10.0 if name == 'lowstate' else 1.0 for name in SIZES}
 _BODIES: Final = {name: os.urandom(size) for name, size in SIZES.items()}
 
 
 def arrivals(seconds: float) -> Iterator[tuple[float, str]]:
-    """(time, sensor) of each object that is made in so many seconds, in order."""
+    """(time, sensor) of each object in this many seconds, in order."""
 
     def stream(name: str, period_s: float) -> Iterator[tuple[float, str]]:
         return ((number * period_s, name) for number in range(int(seconds / period_s)))
@@ -31,7 +31,7 @@ def arrivals(seconds: float) -> Iterator[tuple[float, str]]:
 
 
 def make(sensor: str, name: str) -> DataObject:
-    """One object, of a content that no other has."""
+    """One object with unique content."""
     priority = int(DEFAULT_SENSORS[sensor]['priority'])
     head = f'{sensor}/{name}'.encode()
     return DataObject(

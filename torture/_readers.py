@@ -1,6 +1,6 @@
-"""``python -m torture.fuzz --readers``: each reader of what robots write in a process of its own, with two gigabytes and no more.
+"""``python -m torture.fuzz --readers``: each reader of robots' data in a separate process, limited to two gigabytes.
 
-A process that dies, or does not end a round, is a finding as an exception is; the next one goes on after its seed.
+A process that crashes, or does not end a round, is a finding like an exception; the next one continues with the next seed.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from torture._command import progress
 
 LIMIT_BYTES: Final = 2 << 30
 HANG_S: Final = 60.0
-"""A round takes some milliseconds; of one that takes a minute its reader does not end by itself."""
+"""A round takes some milliseconds; a reader that takes a minute hangs."""
 MAX_TOLD: Final = 20
 TRIES: Final = 20
-"""Processes of one kind that may die before the others have their turn."""
+"""Processes of one kind that may crash before the others have their turn."""
 
 
 @dataclass(slots=True)
 class Told:
-    """What came of one kind of readers."""
+    """The result of one kind of readers."""
 
     rounds: int = 0
     found: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
     peak_bytes: int = 0
-    """Of memory in use, of the largest of its processes."""
+    """Peak memory of its largest process."""
 
     def as_dict(self) -> dict[str, Any]:
         return {
@@ -54,19 +54,19 @@ class Told:
 
 
 def fuzz(kind: str, seed: int, seconds: float) -> Told:
-    """Rounds of one kind until the time is over, or there is enough to tell."""
-    told, end = Told(), time.monotonic() + seconds
+    """Rounds of one kind until the time is over, or there are enough findings."""
+    report, end = Told(), time.monotonic() + seconds
     for _ in range(TRIES):
         left = end - time.monotonic()
-        if left <= 0 or len(told.wrong) >= MAX_TOLD:
+        if left <= 0 or len(report.wrong) >= MAX_TOLD:
             break
         with tempfile.TemporaryDirectory(prefix='readers-') as name:
-            _watch(kind, seed + told.rounds, left, Path(name), told)
-    return told
+            _watch(kind, seed + report.rounds, left, Path(name), report)
+    return report
 
 
-def _watch(kind: str, seed: int, seconds: float, folder: Path, told: Told) -> None:
-    """One process; it says what each round came to."""
+def _watch(kind: str, seed: int, seconds: float, folder: Path, report: Told) -> None:
+    """One process; it reports each round."""
     command = [sys.executable, '-m', 'torture._readers', kind, str(seed), f'{seconds:.3f}', str(folder)]
     environ = {**os.environ, 'TMPDIR': str(folder / 'tmp'), 'PYTHONFAULTHANDLER': '1'}
     (folder / 'tmp').mkdir()
@@ -77,24 +77,24 @@ def _watch(kind: str, seed: int, seconds: float, folder: Path, told: Told) -> No
         assert child.stdout is not None
         is_over = False
         for line in child.stdout:
-            said = json.loads(line)
-            is_over = 'peak' in said
+            reported = json.loads(line)
+            is_over = 'peak' in reported
             if is_over:
-                told.peak_bytes = max(told.peak_bytes, said['peak'])
-            elif 'wrong' in said:
-                told.wrong.append(f'seed {said["seed"]}: {said["wrong"]}')
-                progress(told.wrong[-1])
+                report.peak_bytes = max(report.peak_bytes, reported['peak'])
+            elif 'wrong' in reported:
+                report.wrong.append(f'seed {reported["seed"]}: {reported["wrong"]}')
+                progress(report.wrong[-1])
             else:
-                told.rounds += 1
-                told.found[said['found']] += 1
-            told.rounds += 'wrong' in said
+                report.rounds += 1
+                report.found[reported['found']] += 1
+            report.rounds += 'wrong' in reported
         code = child.wait()
         if not is_over:
             errors.seek(0)
             tail = errors.read()[-2000:].decode(errors='replace')
-            told.wrong.append(f'seed {seed + told.rounds}: the process ended with {code}: {tail}')
-            progress(told.wrong[-1])
-            told.rounds += 1
+            report.wrong.append(f'seed {seed + report.rounds}: the process ended with {code}: {tail}')
+            progress(report.wrong[-1])
+            report.rounds += 1
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -109,14 +109,14 @@ def main(arguments: Sequence[str]) -> None:
     end, wrong = time.monotonic() + seconds, 0
     while time.monotonic() < end and wrong < MAX_TOLD:
         resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + HANG_S), resource.RLIM_INFINITY))
-        said: dict[str, object] = {'seed': seed}
+        reported: dict[str, object] = {'seed': seed}
         try:
-            said['found'] = one(random.Random(seed))
+            reported['found'] = one(random.Random(seed))
         except Exception as error:  # noqa: BLE001 - whatever it is, it is what this looks for
             wrong += 1
             where = traceback.extract_tb(error.__traceback__)[-1]
-            said['wrong'] = f'{type(error).__name__}: {str(error)[:200]} ({where.filename}:{where.lineno})'
-        print(json.dumps(said), flush=True)
+            reported['wrong'] = f'{type(error).__name__}: {str(error)[:200]} ({where.filename}:{where.lineno})'
+        print(json.dumps(reported), flush=True)
         seed += 1
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
     print(json.dumps({'peak': peak}), flush=True)

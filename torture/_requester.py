@@ -1,4 +1,4 @@
-"""A process of its own that asks a robot for what it keeps, and writes down what it saw and asked for: it may be killed."""
+"""A separate process that requests data kept on a robot, and records what it saw and requested: it may be killed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RECENT_S = 120
 
 
 def main(robot: str, output: str, name: str, count: int, threads: int, seed: int) -> None:
-    """Ask so often, each time for a few seconds of a sensor, or of all bags: mostly of what is known to be kept."""
+    """Send this many requests, each for a few seconds of a sensor, or of all bags: mostly for data known to be kept."""
     source, lock = default_source(), Lock()
     store = open_store(source.settings, UploadSettings(read_timeout_s=5.0))
     rng = random.Random(seed)
@@ -35,7 +35,7 @@ def main(robot: str, output: str, name: str, count: int, threads: int, seed: int
             file.write(json.dumps(line) + '\n')
 
     def recent() -> list[dict[str, Any]]:
-        """What the store says is kept, of the last minutes: what was so a minute ago may be gone."""
+        """What the store lists as kept, of the last minutes: older data may be gone."""
         want = KeptFilter(since_ns=time.time_ns() - RECENT_S * SECOND)
         return pull.kept(source, robot, want, Findings(lambda _: None)).to_pylist()
 
@@ -64,7 +64,7 @@ def main(robot: str, output: str, name: str, count: int, threads: int, seed: int
             write({'id': asked.id, 'by': asked.by, 'made_ns': asked.made_ns, 'keys': seen})
             if is_cancelled:
                 pull.cancel(store, source, robot, asked.id, by=name)
-        except (DataLoggerError, OSError) as error:  # the store is away, or the mailbox full: nothing was asked for
+        except (DataLoggerError, OSError) as error:  # the store is down, or the mailbox full: no request was sent
             write({'failed': str(error)[:200]})
 
     with ThreadPoolExecutor(threads) as pool:

@@ -1,7 +1,8 @@
 """Publishers whose stamps and arrivals differ in a known way, and the witness file of what they published.
 
-``python -m torture._skewed WITNESS SECONDS`` waits until each topic has a subscriber, publishes for so long and exits. It does
-not import the package under test.
+``python -m torture._skewed WITNESS SECONDS`` waits until each topic has a subscriber, publishes for this long and exits. It does
+not
+import the package under test.
 """
 
 from __future__ import annotations
@@ -22,20 +23,20 @@ IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 DEPTH: Final = 1000
 BLOCK: Final = 8
 BITS: Final = 16
-"""A picture shows its number in so many squares, black or white."""
+"""An image shows its number as this many squares, black or white."""
 DRIFT: Final = 500e-6
 MATCH_S: Final = 60.0
 SIM_BEGIN_S: Final = 1000.0
 
 
 class Turn(NamedTuple):
-    """Where a publisher is in its run."""
+    """The position of a publisher in its run."""
 
     now_ns: int
-    """The true time at which the content is measured."""
+    """The true time of measurement."""
     elapsed_s: float
     share: float
-    """Of the run, 0 to 1."""
+    """Fraction of the run, 0 to 1."""
 
 
 Stamp = Callable[[Turn], int]
@@ -43,19 +44,19 @@ Stamp = Callable[[Turn], int]
 
 @dataclass(frozen=True, slots=True)
 class Skewed:
-    """One topic. Its sensor is named as the topic."""
+    """One topic. Its sensor has the name of the topic."""
 
     name: str
     stamps: tuple[Stamp, ...]
-    """One of each publisher: turn -> stamp in ns."""
+    """One per publisher: turn -> stamp in ns."""
     causes: frozenset[str] = frozenset()
-    """The causes that the node may report at the end of the run; none: it must not be reported."""
+    """The causes that the node may report at the end of the run; empty: it must not be reported."""
     offset_s: tuple[float, ...] = ()
-    """Received minus stamp at the end of the run, one of each publisher that may be reported."""
+    """Received minus stamp at the end of the run, for each publisher that may be reported."""
     by_arrival: bool = False
     """Whether some of its stamps are not trusted: those messages are dated by their arrival."""
     held: tuple[tuple[float, float], ...] = ()
-    """Shares of the run in which what is due waits in a queue of the publisher."""
+    """Fractions of the run during which due messages wait in a queue of the publisher."""
     type: str = ODOMETRY
     hz: float = 10.0
 
@@ -65,7 +66,7 @@ class Skewed:
 
 
 def constant(ahead_s: float) -> Stamp:
-    """A clock that is so far ahead."""
+    """A clock that is this far ahead."""
     return lambda turn: turn.now_ns + round(ahead_s * SECOND)
 
 
@@ -91,7 +92,7 @@ def repeating() -> Stamp:
 
 
 def simulated(turn: Turn) -> int:
-    """Simulated time that begins again in the middle."""
+    """Simulated time that restarts in the middle."""
     return round((SIM_BEGIN_S + (turn.elapsed_s if turn.share < 0.5 else turn.elapsed_s / 2)) * SECOND)
 
 
@@ -119,7 +120,7 @@ BORDER: Final = frozenset({'ahead_1s'})
 
 
 class Published(NamedTuple):
-    """One message, as its publisher knows it."""
+    """One message, as known to its publisher."""
 
     topic: str
     publisher: int
@@ -144,7 +145,7 @@ def picture(number: int) -> bytes:
 
 
 def number_in(pixels: Any) -> int:
-    """The number that a decoded picture shows."""
+    """The number in a decoded image."""
     middle = np.asarray(pixels)[BLOCK, BLOCK :: 2 * BLOCK]
     return sum(int(np.atleast_1d(middle[bit]).mean() > 127) << bit for bit in range(BITS))
 
@@ -219,7 +220,7 @@ def main(witness: str, seconds: float) -> None:
             for sender in senders:
                 file.writelines(json.dumps(published) + '\n' for published in sender.turn(began_ns, seconds))
             time.sleep(0.002)
-    time.sleep(1.0)  # reliable publishers answer until the reader has everything
+    time.sleep(1.0)  # reliable publishers resend until the reader has everything
     node.destroy_node()
     rclpy.try_shutdown()
 

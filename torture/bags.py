@@ -1,7 +1,7 @@
-"""Kills the node with SIGKILL at random points while it records a bag of the simulated Go2 at full rate, again and again.
+"""Kills the node repeatedly with SIGKILL at random points while it records a bag of the simulated Go2 at full rate.
 
-Afterwards every slice of every bag of the store is opened with other readers and compared with what a witness heard; what is
-missing must belong to a kill and be as little as promised, and the ledger must know of it.
+Afterwards every slice of every bag in the store is opened with other readers and compared with a witness; missing messages must
+belong to a kill and be within the promised limit, and the ledger must list them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from shadowhound_tower.embedded import Tower
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
 from torture._kill_audit import HEADERLESS
 from torture.kills import ROBOT, running
 
@@ -35,12 +35,12 @@ KILLS: Final = 50
 SHORT_KILLS: Final = 3
 UP_S: Final = (0.5, 4.0)
 AT_THE_START: Final = 0.15
-"""Share of the nodes that are killed in their imports, their recovery, or as they begin to record."""
+"""Share of the nodes that are killed during their imports, their recovery, or as they start to record."""
 START_S: Final = (0.1, 2.0)
 LOSS_S: Final = 1.0
-"""What a kill may cost besides the restart ..."""
+"""Maximum loss per kill besides the restart ..."""
 CHUNK_S: Final = 0.25
-"""... and a chunk of a MiB at 4.5 MB a second. How late the machine was comes on top, as the witness saw it."""
+"""... and a chunk of one MiB at 4.5 MB/s. Delays of the machine, as seen by the witness, are added."""
 DELIVER_S: Final = 300.0
 SECOND: Final = 10**9
 BEST_EFFORT: Final = ('/point_cloud2', '/camera/camera_info')
@@ -49,18 +49,18 @@ PARAMETERS: Final[dict[str, Any]] = {'bag.record': 'always', 'bag.slice_s': 3.0}
 
 @dataclass(slots=True)
 class Found:
-    """What the audit found."""
+    """The result of the audit."""
 
     kills: int = 0
     bags: int = 0
     slices: int = 0
     messages: int = 0
     lost_ms: list[int] = field(default_factory=list)
-    """Of each kill: between the newest message that is recorded and the death."""
+    """For each kill: time between the newest recorded message and the kill."""
     allowed_ms: list[int] = field(default_factory=list)
     wrong: dict[str, list[str]] = field(default_factory=dict)
 
-    def say(self, what: str, text: str) -> None:
+    def fail(self, what: str, text: str) -> None:
         self.wrong.setdefault(what, []).append(text)
 
     def bars(self) -> Iterator[Bar]:
@@ -72,10 +72,10 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What happened, before anybody looked at the data."""
+    """What happened, before the data is audited."""
 
     deaths: list[tuple[float, bool]]
-    """When each kill was, s since 1970, and whether that node had listened."""
+    """Time of each kill, s since 1970, and whether that node had listened."""
     node: Node
     """The last one."""
     heard: Path
@@ -91,9 +91,9 @@ def run(processes: Processes, environ: dict[str, str], kills: int, rng: random.R
     node.received('/imu', 50)
     for number in range(1, kills + 1):
         if number > 1 and rng.random() < AT_THE_START:
-            time.sleep(rng.uniform(*START_S))  # the moment of death, not a wait for anything
+            time.sleep(rng.uniform(*START_S))  # a random life span, not a wait for a condition
         else:
-            node.said('logging ')
+            node.await_log('logging ')
             time.sleep(rng.uniform(*UP_S))
         deaths.append((time.time(), 'logging ' in node.log))
         node.kill()
@@ -101,19 +101,19 @@ def run(processes: Processes, environ: dict[str, str], kills: int, rng: random.R
         node = processes.node(environ, PARAMETERS, ready=False)
         if number % 10 == 0:
             progress(f'{number} kills')
-    node.said('logging ')
+    node.await_log('logging ')
     node.received('/imu', node.topic('/imu')['received'] + 100)
     sim.signal(signal.SIGINT)
-    said = published(sim)
+    reported = published(sim)
     node.delivered(1, DELIVER_S)
     node.stop(seconds=60.0)
     witness.signal(signal.SIGTERM)
     witness.wait()
-    return Run(deaths, node, recording, said)
+    return Run(deaths, node, recording, reported)
 
 
-def audit(found: Found, stored: Sequence[Bag], happened: Run, said: dict[str, Any]) -> None:
-    """Compare the bags with what the witness heard and with the ledger."""
+def audit(found: Found, stored: Sequence[Bag], happened: Run, reported: dict[str, Any]) -> None:
+    """Compare the bags with the witness and with the ledger."""
     counts: Counter[str] = Counter()
     times: dict[str, list[int]] = {topic: [] for topic in TYPES}
     contents: dict[tuple[str, int], bytes] = {}
@@ -122,27 +122,27 @@ def audit(found: Found, stored: Sequence[Bag], happened: Run, said: dict[str, An
         try:
             counts += bag.check()
         except Exception as error:  # noqa: BLE001 - whatever a reader says of it is a finding
-            found.say('slices open in other readers', f'{bag.folder.name}: {type(error).__name__} {error}')
+            found.fail('slices open in other readers', f'{bag.folder.name}: {type(error).__name__} {error}')
             continue
         found.slices += len(bag.slices)
         for message in bag.messages():
             times[message.topic].append(message.publish_ns)
             if contents.setdefault((message.topic, message.publish_ns), message.cdr) is not message.cdr:
-                found.say('nothing is twice', f'{message.topic} {message.publish_ns} in {bag.folder.name}')
+                found.fail('nothing is twice', f'{message.topic} {message.publish_ns} in {bag.folder.name}')
     found.messages = counts.total()
     late_ns = _compare(found, happened.heard, times, contents)
-    _judge_losses(found, times, happened.deaths, late_ns)
-    for topic, row in said['bags'].items():
+    _audit_losses(found, times, happened.deaths, late_ns)
+    for topic, row in reported['bags'].items():
         in_bags = counts[topic]
         if (row['stored'], row['open'], row['published']) != (in_bags, 0, happened.published[topic]):
             text = f'{topic}: {in_bags} in bags of {happened.published[topic]}, but {row}'
-            found.say('the ledger knows all', text)
-    if not said['balanced']:
-        found.say('the ledger knows all', str(ledger.imbalances(said)))
+            found.fail('the ledger knows all', text)
+    if not reported['balanced']:
+        found.fail('the ledger knows all', str(ledger.imbalances(reported)))
 
 
 def stamp_of(message: Heard) -> int:
-    """The publish time that a bag has: the stamp of the header, else the time of sending."""
+    """The publish time in a bag: the stamp of the header, otherwise the time of sending."""
     if message.topic in HEADERLESS:
         return message.source_ns
     sec, nanosec = struct.unpack_from('<iI', message.cdr, 4)
@@ -150,7 +150,7 @@ def stamp_of(message: Heard) -> int:
 
 
 def _compare(found: Found, heard_at: Path, times: dict[str, list[int]], contents: dict[tuple[str, int], bytes]) -> int:
-    """What is recorded is what was published, in its order; by how much the witness was late at worst, ns."""
+    """Recorded messages must be published ones, in order; returns the maximum delay of the witness, ns."""
     order: dict[str, list[int]] = {topic: [] for topic in TYPES}
     gap_ns, before = 0, 0
     for message in recorded(heard_at):
@@ -159,17 +159,17 @@ def _compare(found: Found, heard_at: Path, times: dict[str, list[int]], contents
         if cdr is not None:
             order[message.topic].append(stamp_ns)
             if cdr != message.cdr:
-                found.say('equal bytes in the same order', f'{message.topic} {stamp_ns} differs')
+                found.fail('equal bytes in the same order', f'{message.topic} {stamp_ns} differs')
         if message.topic == '/imu':
             gap_ns, before = max(gap_ns, message.source_ns - before if before else 0), message.source_ns
     for topic, recorded_ns in times.items():
         if order[topic] != recorded_ns:
-            found.say('equal bytes in the same order', f'{topic} is in another order, or was not published')
+            found.fail('equal bytes in the same order', f'{topic} is in another order, or was not published')
     return gap_ns
 
 
-def _judge_losses(found: Found, times: dict[str, list[int]], deaths: Sequence[tuple[float, bool]], late_ns: int) -> None:
-    """How old the newest recorded message was at each death of a node that had listened."""
+def _audit_losses(found: Found, times: dict[str, list[int]], deaths: Sequence[tuple[float, bool]], late_ns: int) -> None:
+    """Age of the newest recorded message at each kill of a node that had listened."""
     imu = times['/imu']
     starts = [0, *(round(when * SECOND) for when, _ in deaths)]
     for (before_ns, death_ns), (_, listened) in zip(itertools.pairwise(starts), deaths, strict=True):
@@ -180,11 +180,11 @@ def _judge_losses(found: Found, times: dict[str, list[int]], deaths: Sequence[tu
 
 
 def campaign(folder: Path, kills: int, seed: int) -> Found:
-    """Run and judge; ``folder`` needs some 15 MB a second."""
+    """Run and audit; ``folder`` needs some 15 MB/s."""
     found = Found(kills)
     with Tower(folder / 'tower') as tower, running(folder) as processes:
         happened = run(processes, tower.environment(), kills, random.Random(seed))
-        said = ledger.read(happened.node.home / 'spool', ROBOT)
+        reported = ledger.read(happened.node.home / 'spool', ROBOT)
         progress('every bag is read back')
         store = S3Store(tower.store_settings(), UploadSettings())
         store.open()
@@ -192,16 +192,16 @@ def campaign(folder: Path, kills: int, seed: int) -> Found:
             stored = bags(store, ROBOT, folder / 'bags')
         finally:
             store.close()
-        audit(found, stored, happened, said)
+        audit(found, stored, happened, reported)
         left = list((happened.node.home / 'bags' / ROBOT).glob('*/*'))
         if left:
-            found.say('the ledger knows all', f'{len(left)} files are still in the folder of bags')
+            found.fail('the ledger knows all', f'{len(left)} files are still in the folder of bags')
     return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
-    given = asked_kills(parser('bags', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
+    """The campaign; 0 if all requirements were met."""
+    given = parse_kills(parser('bags', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop:
         found = campaign(shop.folder, given.kills, given.seed)
         bars = list(found.bars())

@@ -1,10 +1,10 @@
-"""Publishes with known clock skews and compares everything that states a time with what was published then.
+"""Publishes with known clock skews and compares everything that contains a time with what was published then.
 
-Publishers stamp with constant offsets (1 ms to 1 h), drift, steps, a stuck stamp, a queue that is held up, two clocks on one
-topic and simulated time that restarts. One node stores every message as an object and records a bag; it is killed (SIGKILL) once
-and started again, so that messages are lost. A witness file states what was published when. Then:
+Publishers stamp with constant offsets (1 ms to 1 h), drift, steps, a stuck stamp, a delayed queue, two clocks on one topic and
+simulated time that restarts. One node stores every message as an object and records a bag; it is killed (SIGKILL) once and
+restarted, so that messages are lost. A witness file records what was published when. Then:
 
-- each stored message has the right pair of times, or is dated by its arrival where its stamps are not trusted, and is counted so;
+- each stored message has the right pair of times, or is dated by its arrival if its stamps are not trusted, and is counted so;
 - each loss is in the gap journal, at the right place on both clocks;
 - at random moments of each clock, the past of the live page, the query and the dataset show what was published then;
 - ``status`` and the ledger report the topics whose stamps are off, with offset and cause, and no others.
@@ -57,30 +57,30 @@ SHORT_SECONDS: Final = 60.0
 MOMENTS: Final = 100
 """On each clock."""
 SPOOL_MOMENTS: Final = 25
-"""Of these, also read from the spool, as the live page on the robot does."""
+"""Of these, also read from the spool, as by the live page on the robot."""
 BATCH_S: Final = 1.0
 KILLED: Final = (0.45, 0.55)
-"""When the node is killed, as shares of the run."""
+"""Times of the kill, as fractions of the run."""
 KILLED_S: Final = 1.5
 LATEST_NS: Final = SECOND
-"""A message arrives so soon after it was sent, also where the machine stands still for a moment; the figures have the latest."""
+"""Maximum time from sending to arrival, even if the machine pauses; the results have the maximum."""
 ARRIVED_NS: Final = SECOND // 2
 """The tolerance of everything else on the clock of arrival, compared with the arrivals in the bags.
 
-Within an object, arrivals are estimated from its first and last, and on a machine under load a message arrived 0.28 s late.
+Within an object, arrivals are estimated from its first and last, and on a loaded machine a message arrived 0.28 s late.
 """
 EXACT_NS: Final = SECOND // 1000
-"""The tolerance of stamps where they are shown; in objects and bags they are exact."""
+"""The tolerance of displayed stamps; in objects and bags they are exact."""
 OPEN_NS: Final = round((BATCH_S + 1.5) * SECOND)
-"""A kill takes at most the messages of so long; its rows may begin or end so far from the loss."""
+"""Maximum age of messages lost in a kill; gap rows may start or end this far from the loss."""
 SHOWN_NS: Final = 8 * SECOND
-"""A message this new must be shown at a moment; the page omits what is older than ten seconds."""
+"""A message this new must be shown at a moment; the page omits messages older than ten seconds."""
 IN_BAG_NS: Final = SECOND
 """The page reads bags for 1.5 s before a moment."""
 AROUND_NS: Final = 3 * SECOND
 NEAR_S: Final = 0.5
 REPORTED_S: Final = 0.5
-"""How far a reported offset may be from the true one."""
+"""Maximum error of a reported offset."""
 Name = tuple[str, int, int]
 """Topic, publisher, number."""
 
@@ -91,7 +91,7 @@ class Stored(NamedTuple):
     stamp_ns: int
     """The time that dates it."""
     received_ns: int
-    """By the bag where it has the message, otherwise when it was sent."""
+    """From the bag if it has the message, otherwise the time of sending."""
 
     def on(self, by: str) -> int:
         return self.stamp_ns if by == BY_STAMP else self.received_ns
@@ -103,9 +103,9 @@ class Run:
 
     node: Node
     published: dict[Name, tuple[int, int]]
-    """(stamp, when it was sent)."""
+    """(stamp, time of sending)."""
     node_reports: dict[str, Any]
-    """The ``stamps`` of each topic at the end of the publishers, of the ledger."""
+    """The ledger's ``stamps`` of each topic at the end of the publishers."""
     findings: Sequence[str]
     """Of ``status``, at the same time."""
     objects: dict[Name, Stored] = field(default_factory=dict)
@@ -119,7 +119,7 @@ class Run:
 
 
 class Bars:
-    """What must hold, and what was found wrong."""
+    """The requirements, and the problems found."""
 
     def __init__(self) -> None:
         self._wrong: dict[str, list[str]] = {}
@@ -140,7 +140,7 @@ BY_TOPIC: Final = {stream.topic: stream for stream in STREAMS}
 
 
 def run(folder: Path, seconds: float, rng: random.Random) -> Run:
-    """Publish, kill the node, start it again, and stop it in order."""
+    """Publish, kill the node, restart it, and stop it cleanly."""
     with free_domain() as domain:
         processes = Processes(folder, domain, ROBOT)
         try:
@@ -220,9 +220,9 @@ def read_objects(found: Run, bars: Bars) -> None:
             _check_object(found, bars, stream, info.key, head.metadata, body)
             row = rows.get(info.key)
             same = ('t_start_ns', 't_end_ns', 'received_start_ns', 'received_end_ns', 'by_arrival')
-            said = {name: None if row is None else row[name] for name in same}
+            reported = {name: None if row is None else row[name] for name in same}
             held = {name: int(head.metadata[name]) if name in head.metadata else None for name in same}
-            bars.check('rows: the times of each object', f'{info.key}: {said} instead of {held}', holds=said == held)
+            bars.check('rows: the times of each object', f'{info.key}: {reported} instead of {held}', holds=reported == held)
 
 
 def _check_object(found: Run, bars: Bars, stream: Skewed, key: str, metadata: Mapping[str, str], body: bytes) -> None:
@@ -248,13 +248,13 @@ def _check_object(found: Run, bars: Bars, stream: Skewed, key: str, metadata: Ma
         found.objects[name] = Stored(dated_ns, log_ns)
     found.keys[key] = [name for name, _ in messages]
     dates = [dated_ns for _, dated_ns in messages]
-    said = [int(metadata.get(word, 0)) for word in ('t_start_ns', 't_end_ns', 'received_start_ns', 'received_end_ns')]
-    off = max(abs(said[2] - min(arrivals)), abs(said[3] - max(arrivals)))
-    text = f'{key}: {said} instead of {[min(dates), max(dates), min(arrivals), max(arrivals)]}'
-    bars.check('objects: the pair of times of each', text, holds=said[:2] == [min(dates), max(dates)] and off <= ARRIVED_NS)
-    said_by_arrival = int(metadata.get('by_arrival', 0))
-    bars.check('objects: messages that are dated by their arrival are counted', f'{key}: {said_by_arrival} of {by_arrival}',
-               holds=said_by_arrival == by_arrival)  # fmt: skip
+    reported = [int(metadata.get(word, 0)) for word in ('t_start_ns', 't_end_ns', 'received_start_ns', 'received_end_ns')]
+    off = max(abs(reported[2] - min(arrivals)), abs(reported[3] - max(arrivals)))
+    text = f'{key}: {reported} instead of {[min(dates), max(dates), min(arrivals), max(arrivals)]}'
+    bars.check('objects: the pair of times of each', text, holds=reported[:2] == [min(dates), max(dates)] and off <= ARRIVED_NS)
+    reported_by_arrival = int(metadata.get('by_arrival', 0))
+    bars.check('objects: messages that are dated by their arrival are counted', f'{key}: {reported_by_arrival} of {by_arrival}',
+               holds=reported_by_arrival == by_arrival)  # fmt: skip
 
 
 def _name(stream: Skewed, message: Any) -> Name:
@@ -268,7 +268,7 @@ def _name(stream: Skewed, message: Any) -> Name:
 
 
 class Loss(NamedTuple):
-    """Messages of a publisher that are not stored, from the one before to the one after, on one clock."""
+    """Consecutive messages of a publisher that are not stored, from the one before to the one after, on one clock."""
 
     from_ns: int
     to_ns: int
@@ -276,7 +276,7 @@ class Loss(NamedTuple):
 
 
 def check_losses(found: Run, bars: Bars) -> None:
-    """Every loss is in the journal on both clocks, and nothing else."""
+    """The journal must have every loss on both clocks, and nothing else."""
     journal = ledger.journal(found.node.home / 'spool', ROBOT)
     bars.check('the kill cost messages', f'{Counter(row.cause for row in journal)}',
                holds=any(row.cause == RESTART for row in journal))  # fmt: skip
@@ -298,7 +298,7 @@ def check_losses(found: Run, bars: Bars) -> None:
 
 
 def _match(real: Sequence[Loss], rows: Sequence[tuple[int, int]]) -> bool:
-    """Whether each row is within a loss, and each loss within rows from its begin to its end."""
+    """Whether each row is within a loss, and each loss is covered by rows from start to end."""
     inside = all(any(loss.from_ns - OPEN_NS <= begin and end <= loss.to_ns + OPEN_NS for loss in real) for begin, end in rows)
     return inside and all(_covers(loss, rows) for loss in real)
 
@@ -321,7 +321,7 @@ def _losses(held: Mapping[Name, Stored], stream: Skewed, by: str) -> Iterator[Lo
 
 
 def _spans(spans: Sequence[tuple[Any, ...]], found: Run) -> list[list[Any]]:
-    """In seconds from the first message, to be read."""
+    """In seconds from the first message, readable."""
     return [
         [None if at is None else round((at - found.began_ns) / SECOND, 2) for at in span[:2]] + list(span[2:]) for span in spans
     ]
@@ -347,7 +347,7 @@ class Timeline:
         return None
 
     def nearest_ns(self, at_ns: int) -> int:
-        """How far the nearest message is."""
+        """Distance to the nearest message."""
         place = bisect_right(self.times, at_ns)
         return min((abs(each - at_ns) for each in self.times[max(0, place - 1) : place + 1]), default=1 << 62)
 
@@ -362,7 +362,7 @@ def moments(lines: Mapping[str, Timeline], rng: random.Random) -> list[int]:
 
 
 def slack_of(by: str, stream: Skewed) -> int:
-    """The tolerance of what is shown on a clock."""
+    """The tolerance of displayed times on a clock."""
     return EXACT_NS if by == BY_STAMP and not stream.by_arrival else ARRIVED_NS
 
 
@@ -393,7 +393,7 @@ def check_page(found: Run, where: str, reader: PastReader, by: str, lines: Mappi
 
 
 def _items(body: bytes) -> dict[str, tuple[dict[str, Any], bytes]]:
-    """By topic, as the page takes them apart."""
+    """By topic, parsed as by the page."""
     found = {}
     while body:
         size, head_size = int.from_bytes(body[:4], 'little'), int.from_bytes(body[4:8], 'little')
@@ -411,19 +411,19 @@ def _shown(topic: str, head: Mapping[str, Any], body: bytes) -> Name:
 
 
 def check_query(found: Run, by: str, begins: Mapping[str, int], at_ns: int, bars: Bars) -> None:
-    """The objects that begin around a moment; ``begins`` is when each began by this clock."""
+    """The objects that start around a moment; ``begins`` has the start of each by this clock."""
     since_ns, until_ns = at_ns - AROUND_NS, at_ns + AROUND_NS
     rows = lake.objects(default_source(), robot=ROBOT, columns=('key',), by=by, since=_time(since_ns), until=_time(until_ns))
-    said = {key for key in rows['key'].to_pylist() if key in found.keys}
+    reported = {key for key in rows['key'].to_pylist() if key in found.keys}
     for key, begin_ns in begins.items():
         slack_ns = slack_of(by, BY_TOPIC[found.keys[key][0][0]])
         text = f'at {_place(found, at_ns)} by {by}: {key} begins {(begin_ns - at_ns) / SECOND:.3f} s after'
         if min(abs(begin_ns - since_ns), abs(begin_ns - until_ns)) > slack_ns:
-            bars.check('query: the objects of a time', text, holds=(key in said) == (since_ns <= begin_ns < until_ns))
+            bars.check('query: the objects of a time', text, holds=(key in reported) == (since_ns <= begin_ns < until_ns))
 
 
 def check_dataset(found: Run, by: str, rng: random.Random, bars: Bars) -> None:
-    """Random samples: the picture is of their time, and what is aligned with it was published then."""
+    """Random samples: the image is of their time, and data aligned with it was published then."""
     lines = {stream.topic: Timeline(found.objects, stream.topic, by) for stream in STREAMS}
     for anchor in ('camera_fine', 'camera_late'):
         first_ns, *_, last_ns = lines[f'/{anchor}'].times
@@ -481,13 +481,13 @@ def check_reports(found: Run, bars: Bars) -> None:
         is_named = stream.topic in named
         if stream.name in BORDER:
             continue
-        said = f'{stream.topic}: {report}'
-        bars.check('ledger: topics whose stamps are off are reported, and no others', said,
+        stated = f'{stream.topic}: {report}'
+        bars.check('ledger: topics whose stamps are off are reported, and no others', stated,
                    holds=(report is not None) == bool(stream.causes))  # fmt: skip
         bars.check('status: the same topics are findings', f'{stream.topic}: {text}', holds=is_named == bool(stream.causes))
         if report is not None and stream.causes:
-            bars.check('ledger: with their cause', said, holds=report['cause'] in stream.causes)
-            bars.check('ledger: with their offset', said, holds=not stream.offset_s or (report['offset_s'] is not None and any(
+            bars.check('ledger: with their cause', stated, holds=report['cause'] in stream.causes)
+            bars.check('ledger: with their offset', stated, holds=not stream.offset_s or (report['offset_s'] is not None and any(
                 abs(report['offset_s'] - each) <= REPORTED_S for each in stream.offset_s)))  # fmt: skip
 
 
@@ -520,7 +520,7 @@ def audit(found: Run, folder: Path, rng: random.Random, bars: Bars) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     options = parser('clocks', __doc__ or '')
     options.add_argument('--seconds', type=float, default=0.0, help=f'how long is published, {SECONDS:g} by default')
     given = options.parse_args(argv)

@@ -1,6 +1,6 @@
-"""A neighbor in the robot's ROS domain makes many topics, and publishers that come and go: what it costs the node in memory.
+"""A neighbor in the robot's ROS domain creates many topics, and publishers that come and go: the node's memory must stay bounded.
 
-The node records all topics into a bag and keeps them for events. What is measured is its resident memory above the level before.
+The node records all topics into a bag and keeps them for events. Its resident memory above the level before is measured.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ PUBLISHERS: Final = 3000
 SHORT_PUBLISHERS: Final = 300
 MESSAGE_BYTES: Final = 1000
 STEP: Final = 300
-"""Publishers between two looks."""
+"""Publishers between two measurements."""
 PEAK_BYTES: Final = 60 << 20
 AFTER_BYTES: Final = 40 << 20
 SETTLE_S: Final = 6.0
 LEFT_S: Final = 100.0
-"""Subscriptions go after 30 s without a publisher, and the heap is given back once a minute."""
+"""Subscriptions are closed after 30 s without a publisher, and the heap is trimmed once per minute."""
 PARAMETERS: Final[dict[str, Any]] = {
     'bag.record': 'always', 'bag.regex': '.*', 'events.regex': '.*', 'mission.join': False,
 }  # fmt: skip
@@ -36,7 +36,7 @@ PROGRAM: Final = Path(__file__).parents[1] / 'test/e2e/crowd.py'
 
 
 class Crowd:
-    """The neighbor, told what to do line by line."""
+    """The neighbor, controlled line by line."""
 
     def __init__(self, processes: Processes) -> None:
         self._popen = subprocess.Popen(
@@ -60,13 +60,13 @@ class Crowd:
 
 
 def resident(node: Node) -> int:
-    """Bytes of the process that are not a file's and no other's (proc(5), RssAnon): shared memory is the middleware's segment."""
+    """Private memory of the process (proc(5), RssAnon): shared memory belongs to the middleware's segment."""
     status = Path(f'/proc/{node.popen.pid}/status').read_text(encoding='ascii')
     return int(status.partition('RssAnon:')[2].split()[0]) << 10
 
 
 def attack(processes: Processes, topics: int, publishers: int, *, wait_s: float) -> dict[str, Any]:
-    """Figures: memory before, at most, and after (bytes); what the ledger of the node says in the end."""
+    """Results: memory before, at its peak, and after (bytes); and the node's final ledger."""
     node = processes.node(None, PARAMETERS)
     time.sleep(SETTLE_S)
     before = peak = resident(node)
@@ -94,10 +94,10 @@ def attack(processes: Processes, topics: int, publishers: int, *, wait_s: float)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when every bar holds."""
+    """The campaign; 0 if every bar is met."""
     options = parser('crowd', __doc__ or '')
     options.add_argument('--topics', type=int, default=TOPICS, help='how many at once')
-    options.add_argument('--publishers', type=int, default=0, help=f'that come and go, {PUBLISHERS} unless told')
+    options.add_argument('--publishers', type=int, default=0, help=f'that come and go (default {PUBLISHERS})')
     given = options.parse_args(argv)
     publishers = given.publishers or (SHORT_PUBLISHERS if given.short else PUBLISHERS)
     with workshop(given) as shop, free_domain() as domain:

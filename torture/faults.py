@@ -1,6 +1,6 @@
-"""Bad days between the logger and its store: everything has to be delivered exactly once to effect, whatever happens.
+"""Bad days between the logger and its store: everything must be delivered effectively exactly once, whatever happens.
 
-Each day has a seed of its own, which makes its objects, kills and faults: ``--seed`` is that of the first one.
+Each day has a separate seed, which determines its objects, kills and faults: ``--seed`` is that of the first one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SHORT: Final = 100, 5
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 1 when something was lost, doubled or overwritten on some day."""
+    """Exit code 1 if anything was lost, duplicated or overwritten on some day."""
     options = parser('faults', 'Bad days between the logger and its store.')
     options.set_defaults(seed=given_seed())
     options.add_argument('--simulated', type=int, metavar='N', help=f'days in virtual time; {LONG[0]}, in short {SHORT[0]}')
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if live_days:
         with workshop(given) as shop, Tower(shop.folder) as tower:
             found['over real sockets'] = live(range(given.seed, given.seed + live_days), tower, progress)
-            shop.passed = True  # the seed tells all that its data would
+            shop.passed = True  # the seed reproduces all its data
     if not given.json:
         for where, summary in found.items():
             print(f'{where}:', *summary.lines(), sep='\n  ')
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _bar(where: str, summary: Summary) -> Bar:
-    what = f'all objects of {summary.days} days {where} are delivered exactly once to effect'
+    what = f'all objects of {summary.days} days {where} are delivered effectively exactly once'
     return Bar(what, not summary.failures, ', '.join(f'not with seed {seed}' for seed in summary.failures))
 
 

@@ -1,8 +1,9 @@
-"""Fills the disk under a node that records, for a minute, and breaks it: it stays up, gives up the least important, and goes on.
+"""Fills the disk under a recording node for a minute, then breaks it: it must keep running, evict by priority, and
+recover.
 
-The spool lies on a small file system of its own; the store is away meanwhile. First the node fills it itself and keeps the
-reserve of free space; then somebody else writes until nothing is free at all; then there is space again. Last, where it is
-ext4, the kernel makes it read-only as it does after an error, and it is repaired.
+The spool is on a separate small file system; the store is down. First the node fills it itself and must keep the reserve of free
+space; then another process writes until nothing is free at all; then there is space again. Finally, on ext4, the kernel makes it
+read-only as it does after an error, and it is repaired.
 """
 
 from __future__ import annotations
@@ -42,25 +43,25 @@ SIZE_MB: Final = 96
 RESERVE: Final = 24 * MEBI
 """``spool.min_free_bytes``."""
 WITHIN: Final = 4 * MEBI
-"""What the index's log and one commit may take of the reserve for a moment."""
+"""How much of the reserve the index's log and one commit may use temporarily."""
 FULL_S: Final = 60.0
 SHORT_FULL_S: Final = 8.0
 EVENTS: Final = 8
 SLICE_S: Final = 3.0
 RECORDED_S: Final = 300.0
-"""Slices are the least important: where the machine is too busy to send all that the robot publishes, they wait."""
+"""Slices have the lowest priority: on a machine too busy to send everything that the robot publishes, they wait."""
 BUCKET: Final = 'sensor-data'
 
 
 @dataclass(slots=True)
 class Findings:
-    """What was seen while it went on."""
+    """What was observed during the run."""
 
     wrong: dict[str, list[str]] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
 
     def check(self, what: str, holds: object, found: object = '') -> None:
-        """It must hold each time it is looked at."""
+        """It must be true at each check."""
         lines = self.wrong.setdefault(what, [])
         if not holds:
             lines.append(str(found))
@@ -70,7 +71,7 @@ class Findings:
 
 
 class FullDisk:
-    """One node, one robot, one disk. Life: New; run once."""
+    """One node, one robot, one disk. Lifecycle: New; run once."""
 
     def __init__(self, processes: Processes, wire: Wire, tower: Tower, disk: Disk, seed: int) -> None:
         self._processes, self._wire, self._tower, self._disk = processes, wire, tower, disk
@@ -88,9 +89,9 @@ class FullDisk:
         self._is_filled(node, full_s)
         self._has_space_again(node)
         sim.signal(2)
-        said = published(sim)
+        reported = published(sim)
         node.delivered(1, 120.0)
-        self._at_the_end(node.stop(seconds=60.0), said)
+        self._at_the_end(node.stop(seconds=60.0), reported)
         if self._disk.kind == 'ext4':
             self._breaks()
         return self.found
@@ -100,7 +101,7 @@ class FullDisk:
         return self._processes.node(self._environ, parameters, home=str(self._home))
 
     def _protect(self) -> None:
-        """Preserved events, as a mission would leave them."""
+        """Preserved events, as from a mission."""
         clock = SystemClock.of_this_machine()
         spool = Spool(self._home / 'spool', SpoolSettings(min_free_bytes=0), clock, ROBOT)
         spool.open()
@@ -113,7 +114,7 @@ class FullDisk:
         spool.close()
 
     def _watch(self, node: Node, seconds: float, *, reserve: bool = False) -> int:
-        """Look again and again; the least free space that was seen."""
+        """Check repeatedly; returns the minimum free space."""
         least, end = self._disk.free(), time.monotonic() + seconds
         while time.monotonic() < end:
             least = min(least, self._disk.free())
@@ -168,19 +169,19 @@ class FullDisk:
 
         until(is_recorded, 'a slice of after it is delivered', RECORDED_S)
 
-    def _at_the_end(self, said: dict[str, Any], published: dict[str, int]) -> None:
-        found, objects = self.found, said['objects']
+    def _at_the_end(self, reported: dict[str, Any], published: dict[str, int]) -> None:
+        found, objects = self.found, reported['objects']
         found.figures |= {'objects': objects, 'topics': {
             topic: {name: row[name] for name in ('published', 'received', 'missed', 'dropped', 'stored', 'stored_in')}
-            for topic, row in said['topics'].items()
+            for topic, row in reported['topics'].items()
         }}  # fmt: skip
         found.check('objects were evicted, and counted', objects['evicted'] > 0)
         found.check('everything else is delivered', objects['spooled'] == objects['evicted'] + objects['delivered'], objects)
-        for topic, row in said['topics'].items():
+        for topic, row in reported['topics'].items():
             fine = is_accounted(row['published'], published[topic]) and row['open'] == 0
             found.check('every message is accounted for', fine, (topic, f'{published[topic]} published', row))
         self._are_safe('protected objects are delivered whole')
-        self._are_recorded(said['bags'], published)
+        self._are_recorded(reported['bags'], published)
 
     def _are_safe(self, what: str) -> None:
         store = S3Store(self._tower.store_settings(), UploadSettings())
@@ -194,7 +195,7 @@ class FullDisk:
             store.close()
 
     def _are_recorded(self, rows: dict[str, Any], published: dict[str, int]) -> None:
-        """Each slice that is there opens, and each message that is in none is in the manifest, and in the ledger."""
+        """Each existing slice opens, and each message that is in none is in the manifest, and in the ledger."""
         store = S3Store(self._tower.store_settings(), UploadSettings())
         store.open()
         try:
@@ -219,14 +220,14 @@ class FullDisk:
         self.found.check('bag, manifest and ledger agree', lost['slices'] == evicted, (lost['slices'], evicted))
 
     def _set_aside(self, bag: Bag) -> None:
-        """Slices that were evicted on their way, and arrived all the same: the manifest calls them missing."""
-        told = {each['file'] for each in bag.manifest['slices']}
+        """Slices that were evicted during their upload, and arrived anyway: the manifest lists them as missing."""
+        report = {each['file'] for each in bag.manifest['slices']}
         evicted = {each['file'] for each in bag.manifest['missing'] if each['what'] == EVICTED}
         with closing(Index(self._home / 'spool' / 'index.db', read_only=True)) as index:
             index.open()
             states = {row['key']: row['state'] for row in index.objects.with_prefix(BUCKET, f'{ROBOT}/rosbags/')}
         others = {path.name: states.get(f'{ROBOT}/rosbags/{bag.folder.name}/{path.name}') for path in bag.slices
-                  if path.name not in told}  # fmt: skip
+                  if path.name not in report}  # fmt: skip
         fine = all(name in evicted and state == 'evicted' for name, state in others.items())
         self.found.check('a slice of the store is in the manifest, or was evicted on its way', fine, others)
         self.found.figures['slices_evicted_on_their_way'] = len(others)
@@ -234,17 +235,17 @@ class FullDisk:
             (bag.folder / name).unlink()
 
     def _breaks(self) -> None:
-        """Read-only: the node stays up and tells, and the next one goes on where the disk was left."""
+        """Read-only: the node keeps running and reports it, and the next one continues from the disk."""
         progress('the disk becomes read-only')
         node = self._node()
         sim = self._processes.sim('image_raw:=false')
         node.received('/imu', node.topic('/imu').get('received', 0) + 100)
         self._disk.break_down()
-        time.sleep(5.0)  # what it does in this time is what is looked at
+        time.sleep(5.0)  # its behavior during this time is checked
         self.found.check('the node is alive', node.popen.poll() is None, node.log[-500:])
-        told = re.findall('spool-writer failed.*', node.log)  # the commit of that instant fails otherwise than the next
-        kinds = Counter(line.partition(' cannot be written: ')[2] for line in told)
-        self.found.check('a read-only disk is told, each kind of error once', bool(told) and set(kinds.values()) == {1}, told)
+        report = re.findall('spool-writer failed.*', node.log)  # the commit at that instant fails differently from the next
+        kinds = Counter(line.partition(' cannot be written: ')[2] for line in report)
+        self.found.check('a read-only disk is told, each kind of error once', bool(report) and set(kinds.values()) == {1}, report)
         sim.signal(2)
         published(sim)
         node.signal(2)
@@ -257,9 +258,9 @@ class FullDisk:
         node.received('/imu', before + 200, 30.0)
         published(sim)
         node.delivered(1, 60.0)
-        said = node.stop(seconds=60.0)
-        fine = not ledger.imbalances(said) and not said['objects']['pending']
-        self.found.check('after the repair it goes on', fine, said['objects'])
+        reported = node.stop(seconds=60.0)
+        fine = not ledger.imbalances(reported) and not reported['objects']['pending']
+        self.found.check('after the repair it goes on', fine, reported['objects'])
 
 
 def rss_mb(node: Node) -> float:
@@ -269,7 +270,7 @@ def rss_mb(node: Node) -> float:
 
 
 def campaign(folder: Path, seed: int, full_s: float) -> Findings:
-    """Raises NotAllowed where nothing may be mounted."""
+    """Raises NotAllowed if mounting is not permitted."""
     with ExitStack() as stack:
         disk = stack.enter_context(small_disk(folder, SIZE_MB))
         progress(f'a disk of {SIZE_MB} MiB ({disk.kind})')
@@ -280,7 +281,7 @@ def campaign(folder: Path, seed: int, full_s: float) -> Findings:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     given = parser('full_disk', __doc__ or '').parse_args(argv)
     try:
         with workshop(given) as shop:

@@ -1,9 +1,11 @@
-"""Hostile messages through every encoder, damaged spools and indexes through recovery: no crash, no hang, no damage as good.
+"""Hostile messages through every encoder, damaged spools and indexes through recovery: no crash, no hang, no damage passes as
+good.
 
-With ``--readers``, everything that reads what robots write instead (torture/_readers.py): no error but ours, nothing written
-elsewhere, two gigabytes of memory.
+With ``--readers``, all readers of robots' data instead (torture/_readers.py): only our own errors, nothing written elsewhere, at
+most
+two gigabytes of memory.
 
-Each round has a seed of its own, which is all that it takes to see it again: ``--seed`` is that of the first one.
+Each round is reproducible from its seed: ``--seed`` is that of the first one.
 """
 
 from __future__ import annotations
@@ -34,18 +36,18 @@ from torture.rot import SHARED_MEMORY
 SECONDS: Final = 600.0
 SHORT_SECONDS: Final = 20.0
 HANG_S: Final = 30.0
-"""A round takes a hundredth of a second."""
+"""A round takes 0.01 s."""
 MAX_TOLD: Final = 20
 Round = Callable[[int], Mapping[str, int]]
 
 
 class Hang(BaseException):
-    """A round that does not end; no supervised loop of ours catches it."""
+    """A round that does not end; our supervised loops do not catch it."""
 
 
 @dataclass(slots=True)
 class Field:
-    """What came of one kind of rounds."""
+    """The result of one kind of rounds."""
 
     rounds: int = 0
     found: Counter[str] = field(default_factory=Counter)
@@ -57,7 +59,7 @@ class Field:
 
 @contextmanager
 def at_most(seconds: float) -> Iterator[None]:
-    """Raises Hang in the midst of whatever takes longer."""
+    """Raises Hang in code that takes longer."""
 
     def on_alarm(*_: object) -> None:
         raise Hang(f'it did not end within {seconds:g} s')
@@ -72,7 +74,7 @@ def at_most(seconds: float) -> Iterator[None]:
 
 
 def fuzz(one: Round, seed: int, seconds: float) -> Field:
-    """Rounds with rising seeds until the time is over."""
+    """Rounds with increasing seeds until the time is over."""
     result = Field()
     end = time.monotonic() + seconds
     while time.monotonic() < end and len(result.wrong) < MAX_TOLD:
@@ -102,7 +104,7 @@ def messages(folder: Path) -> Round:
 
 
 def spools(folder: Path, *, edited: bool) -> Round:
-    """Damage to the files of a spool; or, ``edited``, to what its index says."""
+    """Damage to the files of a spool; or, ``edited``, to the content of its index."""
     base = folder / ('edited' if edited else 'rotted')
     bodies = rotting.new_base(base)
     root = folder / 'damaged'
@@ -126,10 +128,10 @@ def spools(folder: Path, *, edited: bool) -> Round:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     options = parser('fuzz', __doc__ or '')
     options.add_argument(
-        '--seconds', type=float, default=0.0, help=f'how long, {SECONDS:g} unless told, {SHORT_SECONDS:g} in short'
+        '--seconds', type=float, default=0.0, help=f'how long, {SECONDS:g} by default, {SHORT_SECONDS:g} in short'
     )
     options.add_argument('--readers', action='store_true', help='what reads the data of robots, instead of what makes them')
     given = options.parse_args(argv)
@@ -153,20 +155,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fuzz_readers(given: argparse.Namespace, seconds: float) -> int:
-    told: dict[str, _readers.Told] = {}
+    report: dict[str, _readers.Told] = {}
     for kind in _readers.KINDS:
-        told[kind] = _readers.fuzz(kind, given.seed, seconds / len(_readers.KINDS))
-        progress(f'{kind}: {told[kind].rounds} rounds, {len(told[kind].wrong)} wrong')
+        report[kind] = _readers.fuzz(kind, given.seed, seconds / len(_readers.KINDS))
+        progress(f'{kind}: {report[kind].rounds} rounds, {len(report[kind].wrong)} wrong')
     if not given.json:
-        for kind, result in told.items():
+        for kind, result in report.items():
             found = ', '.join(f'{count} {outcome}' for outcome, count in result.found.most_common(6))
             print(f'{result.rounds} rounds of {kind}, {result.peak_bytes / 1e6:.0f} MB at most: {found}')
             print(*(f'    {wrong}' for wrong in result.wrong), sep='\n', end='\n' if result.wrong else '')
     what = 'no error but ours, nothing written elsewhere, in 2 GB'
     bars = [Bar(f'readers of {kind}: {what}', not result.wrong and result.rounds > 0,
                 f'{len(result.wrong)} of {result.rounds} rounds' if result.wrong else '')
-            for kind, result in told.items()]  # fmt: skip
-    return verdict({'seed': given.seed, 'seconds': seconds, **{kind: each.as_dict() for kind, each in told.items()}}, bars,
+            for kind, result in report.items()]  # fmt: skip
+    return verdict({'seed': given.seed, 'seconds': seconds, **{kind: each.as_dict() for kind, each in report.items()}}, bars,
                    as_json=given.json)  # fmt: skip
 
 

@@ -1,7 +1,7 @@
-"""Kills the node, the mission agent and the process that sends, each at random, with MLflow and the store up and down.
+"""Kills the node, the mission agent and the sending process, each at random, with MLflow and the store up and down.
 
 The simulated Go2 walks all the time. Afterwards each mission must be one run with every point and frame that agent and node have
-journaled, each once; so must the store; and every object of the robot must name the mission of its time, and no other.
+journaled, each once; the same in the store; and every object of the robot must name the mission of its time, and no other.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.pictures import NAMES
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
 from torture.kills import ROBOT, running
 
 KILLS: Final = 50
@@ -46,9 +46,9 @@ AT_THE_START: Final = 0.2
 AGENT_PERIOD_S: Final = 0.02
 DELIVER_S: Final = 600.0
 NOTICED_NS: Final = 2 * SECOND
-"""So late may a node on a machine that is loaded notice that a mission began or ended."""
+"""Maximum delay of a node on a loaded machine in detecting a mission's start or end."""
 LAST_NS: Final = SECOND
-"""What is published so shortly before the agent is killed may reach the node after it knows of the end."""
+"""Messages published this shortly before the agent is killed may reach the node after it knows of the end."""
 PARAMETERS: Final[dict[str, Any]] = {
     'mission.frame_every_s': 1.0, 'lowstate.batch_s': 1.0,
     'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
@@ -64,7 +64,7 @@ WHAT: Final[dict[str, str]] = {
 
 @dataclass(slots=True)
 class Flight:
-    """A mission, and the last call that its agent was told had returned."""
+    """A mission, and the last call that had returned to its agent."""
 
     folder: MissionFolder
     acknowledged: int
@@ -81,7 +81,7 @@ class Flight:
 
 
 class Killer:
-    """One robot, and agents and nodes one after the other in one home. Life: New; run once."""
+    """One robot, and agents and nodes one after the other in one home. Lifecycle: New; run once."""
 
     def __init__(self, processes: Processes, wires: Sequence[Wire], environ: dict[str, str], rng: random.Random,
                  agent_period_s: float = AGENT_PERIOD_S) -> None:  # fmt: skip
@@ -91,7 +91,7 @@ class Killer:
         self._csv = processes.folder / 'trajectory.csv'
         self._csv.write_text('timestamp,x,y,yaw\n')
         self._agent: subprocess.Popen[bytes] | None = None
-        self._said = processes.folder / 'agent'
+        self._reported = processes.folder / 'agent'
         self.node = self._start_node()
         self.counts: Counter[str] = Counter()
         self.flights: list[Flight] = []
@@ -99,20 +99,20 @@ class Killer:
 
     def run(self, kills: int) -> None:
         sim = self._processes.sim('image_raw:=false')
-        self.node.said('logging ')
+        self.node.await_log('logging ')
         self._start_agent()
         for number in range(1, kills + 1):
             for wire in self._wires:
                 wire.set(self._rng.choice((PASS, PASS, REFUSE, HANG)))
             if self._rng.random() > AT_THE_START:
-                self.node.said('logging ')
-            time.sleep(self._rng.uniform(*UP_S))  # the moment of death, not a wait for anything
+                self.node.await_log('logging ')
+            time.sleep(self._rng.uniform(*UP_S))  # a random life span, not a wait for a condition
             self._kill(self._rng.choice((NODE, AGENT, AGENT, SENDER)))
             if number % 10 == 0:
                 progress(f'{number} kills: {dict(self.counts)}')
         for wire in self._wires:
             wire.set(PASS)
-        self.node.said('logging ')
+        self.node.await_log('logging ')
         self._kill_agent()
         sim.signal(signal.SIGINT)
         published(sim)
@@ -133,21 +133,21 @@ class Killer:
         return self._processes.node(self._environ, PARAMETERS, ready=False)
 
     def _start_agent(self) -> None:
-        """A half of them log no trajectory, so that the node's is the mission's."""
+        """Half of them log no trajectory, so that the mission has the node's."""
         csv = self._rng.choice((str(self._csv), NO_CSV))
         command = [sys.executable, '-m', 'missions.agent', str(self.home), COMMAND, csv, str(self._agent_period_s)]
         test = str(Path(__file__).parents[1] / 'test')
         path = os.pathsep.join(filter(None, (test, os.environ.get('PYTHONPATH'))))
         environ = {**os.environ, **self._environ, 'SHADOWHOUND_ROBOT': ROBOT, 'PYTHONPATH': path}
-        with self._said.open('wb') as output:
+        with self._reported.open('wb') as output:
             self._agent = subprocess.Popen(command, stdout=output, env=environ)
-        until(lambda: b'\n' in self._said.read_bytes(), 'the agent has begun its mission')
+        until(lambda: b'\n' in self._reported.read_bytes(), 'the agent has begun its mission')
 
     def _kill_agent(self) -> None:
         assert self._agent is not None
         self._agent.kill()
         self._agent.wait()
-        lines = self._said.read_text().splitlines()
+        lines = self._reported.read_text().splitlines()
         known = {flight.folder.mission_id for flight in self.flights}
         (folder,) = [each for each in missions(self.home) if each.mission_id not in known]
         self.flights.append(Flight(folder, int(lines[-1]) if len(lines) > 1 else -1))
@@ -155,14 +155,14 @@ class Killer:
 
 @dataclass(slots=True)
 class Found:
-    """What does not hold, by bar; and how much was looked at."""
+    """Violations, by bar; and how much was checked."""
 
     wrong: dict[str, list[str]] = field(default_factory=lambda: {name: [] for name in WHAT})
     looked: Counter[str] = field(default_factory=Counter)
 
 
-def judge(found: Found, server: Server, flight: Flight, objects: Mapping[str, ObjectInfo]) -> None:
-    """One mission, by its journals, against the run and the store."""
+def audit(found: Found, server: Server, flight: Flight, objects: Mapping[str, ObjectInfo]) -> None:
+    """Compare one mission's journals with the run and the store."""
     name = flight.folder.mission_id
     runs = [run for run in server.runs(COMMAND) if run.data.tags['shadowhound.mission_id'] == name]
     end_ms = flight.span_ns[1] // 1_000_000
@@ -182,15 +182,15 @@ def judge(found: Found, server: Server, flight: Flight, objects: Mapping[str, Ob
     found.looked['poses'] += sum(there.values())
     if there != Counter(set(wanted)):
         found.wrong['node'].append(f'{name}: {len(wanted)} journaled, {len(there)} in the run')
-    judge_files(found, server, flight, run_id, objects)
+    audit_files(found, server, flight, run_id, objects)
 
 
 def _both(flight: Flight) -> bool:
-    """Whether the node has logged the battery as well: then the agent's last value is said once more, as the newest."""
+    """Whether the node has logged the battery as well: then the agent's last value is logged once more, as the newest."""
     return any(name == NODE and 'battery_pct' in record['m'] for name, record in flight.logged('metrics'))
 
 
-def judge_files(found: Found, server: Server, flight: Flight, run_id: str, objects: Mapping[str, ObjectInfo]) -> None:
+def audit_files(found: Found, server: Server, flight: Flight, run_id: str, objects: Mapping[str, ObjectInfo]) -> None:
     """Frames, trajectory and summary, in the run and in the store."""
     name, frames = flight.folder.mission_id, [record['id'] for _, record in flight.logged('frame')]
     attached = {record['id'] for _, record in flight.logged('frame') if record.get('artifact')}
@@ -211,10 +211,10 @@ def judge_files(found: Found, server: Server, flight: Flight, run_id: str, objec
         found.wrong['store'].append(f'{name}: {sorted(stored ^ {prefix + each for each in names})[:5]}')
 
 
-def judge_marks(found: Found, flights: Sequence[Flight], objects: Mapping[str, ObjectInfo]) -> None:
-    """Of the sensors' objects: no folder of those begins with ``_``. At both ends the node may be as late as ``NOTICED_NS``.
+def audit_marks(found: Found, flights: Sequence[Flight], objects: Mapping[str, ObjectInfo]) -> None:
+    """Check the sensors' objects, whose folders do not start with ``_``. At both ends the node may be late by ``NOTICED_NS``.
 
-    Of the last ``LAST_NS`` of a mission some may be of none.
+    Objects of the last ``LAST_NS`` of a mission may have no mission.
     """
     spans = {flight.folder.mission_id: flight.span_ns for flight in flights}
     runs = {flight.folder.mission_id: run.run_id for flight in flights if (run := flight.folder.run())}
@@ -222,17 +222,17 @@ def judge_marks(found: Found, flights: Sequence[Flight], objects: Mapping[str, O
         folder = key.split('/')[1]
         if folder == 'missions' or folder.startswith('_') or 't_start_ns' not in info.metadata:
             continue
-        at_ns, said = int(info.metadata['t_start_ns']), info.metadata.get('mission_id')
-        found.looked['marked' if said else 'unmarked'] += 1
+        at_ns, reported = int(info.metadata['t_start_ns']), info.metadata.get('mission_id')
+        found.looked['marked' if reported else 'unmarked'] += 1
         inside = {name for name, (start, end) in spans.items() if start + NOTICED_NS <= at_ns <= end - LAST_NS}
         near = {name for name, (start, end) in spans.items() if start <= at_ns <= end + NOTICED_NS}
-        is_right = said in near if said else not inside
-        if not is_right or (said and info.metadata.get('run_id', runs.get(said)) != runs.get(said)):
-            found.wrong['marks'].append(f'{key} says {said}')
+        is_right = reported in near if reported else not inside
+        if not is_right or (reported and info.metadata.get('run_id', runs.get(reported)) != runs.get(reported)):
+            found.wrong['marks'].append(f'{key} says {reported}')
 
 
 def stored(tower: Tower) -> dict[str, ObjectInfo]:
-    """All of the bucket."""
+    """The complete bucket."""
     store = S3Store(tower.store_settings(), UploadSettings())
     store.open()
     try:
@@ -243,7 +243,7 @@ def stored(tower: Tower) -> dict[str, ObjectInfo]:
 
 
 def campaign(folder: Path, kills: int, seed: int) -> tuple[Found, Counter[str]]:
-    """Run and judge."""
+    """Run and audit."""
     found = Found()
     with Tower(folder / 'tower', mlflow=True) as tower, Wire(tower.tracking_uri) as mlflow, Wire(tower.endpoint_url) as s3:
         environ = tower.environment() | {
@@ -264,14 +264,14 @@ def campaign(folder: Path, kills: int, seed: int) -> tuple[Found, Counter[str]]:
         progress('every run and object is read back')
         objects, server = stored(tower), Server(tower, mlflow)
         for flight in killer.flights:
-            judge(found, server, flight, objects)
-        judge_marks(found, killer.flights, objects)
+            audit(found, server, flight, objects)
+        audit_marks(found, killer.flights, objects)
     return found, killer.counts
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
-    given = asked_kills(parser('joined', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
+    """The campaign; 0 if all requirements were met."""
+    given = parse_kills(parser('joined', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop:
         found, counts = campaign(shop.folder, given.kills, given.seed)
         bars = [Bar(text, not found.wrong[name], '; '.join(found.wrong[name][:3])) for name, text in WHAT.items()]

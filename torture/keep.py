@@ -1,11 +1,15 @@
-"""Kills robot, requester and Tower while much is asked for of what the robot keeps, and the disk is short of room or full.
+"""Kills robot, requester and Tower while many requests for kept data are open, and the disk is short of space or full.
 
-A node keeps pictures, clouds, batches and slices, more than keep.max_bytes lets it, on a small disk that somebody else fills at
-times. Requesters ask for random seconds of it, some for a moment only, some take it back, a hundred at once; any of the others
-may be killed. What happens next depends on what was answered, never on the time: a slow machine makes the campaign longer, not
-easier. Afterwards every request has its last answer, everything that was seen at the asking is in the store, verified, or
-accounted for, of slices the messages of the time that was asked for, and the ledger closes. A campaign that served few, or in
-which some kind of fault never fell while requests were open, has failed.
+A node keeps images, clouds, batches and slices, more than keep.max_bytes allows, on a small disk that another process fills at
+times.
+Requesters request random seconds of it, some with a short expiry, some cancel, a hundred at the same time; any process may be
+killed.
+What happens next depends on the answers, never on the time: a slow machine makes the campaign longer, not easier. Afterwards
+every
+request has its last answer, every object seen at the time of the request is in the store, verified, or accounted for, of slices
+the
+messages of the requested time, and the ledger balances. A campaign that served few requests, or in which some kind of fault never
+happened while requests were open, has failed.
 """
 
 from __future__ import annotations
@@ -48,31 +52,31 @@ from shadowhound_data_logger.lake.row_files import RowFile, read
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
 from torture._disks import Disk, NotAllowed, inside, small_disk
 
 ROBOT: Final = 'thor'
 KILLS, SHORT_KILLS = 30, 5
 AT_ONCE: Final = 100
 COUNT: Final = 10
-"""Requests of one requester, who is followed by another one when few are open."""
+"""Requests per requester; another one starts when few are open."""
 FEW: Final = 6
 ANSWERED: Final = 5
 """Requests that get an object between a fault and the next kill."""
 SERVED_A_KILL, SERVED_SHARE = 3, 1 / 3
-"""At the least: a campaign in which fewer requests got an object has proved nothing."""
+"""Minimum number of requests that must get an object: with fewer, a campaign has verified nothing."""
 AT_THE_START: Final = 0.2
 """Share of the nodes that are killed once more before they listen."""
 ABOVE: Final = 20
-"""Objects that are spooled, or evicted, while a store is away, or the disk full."""
+"""Objects that are spooled, or evicted, while a store is down, or the disk full."""
 FULL_S: Final = 60.0
-"""With a full disk not even an eviction may be written down: then the kill comes after this."""
+"""With a full disk not even an eviction can be recorded: then the kill comes after this."""
 WAIT_S: Final = 900.0
-"""Longer than anything takes that works, on a machine that is busy with much else."""
+"""Longer than any working operation takes on a busy machine."""
 EXPIRY_S: Final = 15.0
-"""Of a request that is to expire in the middle; longer when nothing was sent by then."""
+"""Expiry of a request that must expire during its upload; longer if nothing was sent by then."""
 MUCH: Final = 100
-"""Kept objects, more than are released at once."""
+"""Kept objects, more than are released at a time."""
 TRIES: Final = 5
 PARAMETERS: Final[dict[str, Any]] = {
     'camera.rate_hz': 5.0, 'camera.ship': 'on_request', 'lidar.ship': 'on_request', 'imu.ship': 'on_request',
@@ -82,37 +86,37 @@ PARAMETERS: Final[dict[str, Any]] = {
     'upload.max_mbps': 8.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
 }  # fmt: skip
 NO_ROOM: Final = {'spool.min_free_bytes': 1 << 60}
-"""A reserve that no disk has: whatever may go has to."""
+"""A reserve that no disk has: everything that may be evicted is."""
 DISK_MB: Final = 256
 HOME: Final = 'disk/home'
 KILL, REQUESTER, TOWER, REFUSED, HUNG, FULL, EXPIRY, CROWD, EVICTION = KINDS = (
     'kill of the robot', 'kill of a requester', 'kill of Tower', 'outage', 'outage that hangs', 'full disk',
     'expiry in the middle of a pull', f'{AT_ONCE} requests at once', 'eviction of what was asked for',
 )  # fmt: skip
-"""Each has to fall while requests are open."""
+"""Each must happen while requests are open."""
 
 
 class Campaign:
-    """One robot, its Tower behind a wire, and those who ask. Life: New; run once."""
+    """One robot, its Tower behind a wire, and the requesters. Lifecycle: New; run once."""
 
     def __init__(self, folder: Path, disk: Disk, tower: Tower, wire: Wire, processes: Processes,
                  rng: random.Random) -> None:  # fmt: skip
         self._folder, self._tower, self._wire, self._processes, self._rng = folder, tower, wire, processes, rng
         self._environ = tower.environment() | {'AWS_ENDPOINT_URL': wire.url}
         self._requesters: list[subprocess.Popen[bytes]] = []
-        self._said = folder / 'asked.jsonl'
+        self._record = folder / 'asked.jsonl'
         self._source = Bucket(tower.store_settings(), 'sensor-data')
         self._node: Node
         self.unbalanced: list[str] = []
         self.failed = 0
-        """Times that nothing was asked for, since the store was away."""
+        """Number of requests that were not sent because the store was down."""
         self.exercised = Counter[str]()
-        """Kind of fault -> how often it fell while requests were open."""
+        """Kind of fault -> how often it happened while requests were open."""
         self.home = folder / HOME
         self._filler = disk.path / 'filler'
 
     def run(self, kills: int) -> None:
-        """Everything but the judgement; the node has stopped then."""
+        """Everything except the audit; the node is stopped then."""
         self._start()
         sim = self._processes.sim('rate_scale:=0.2', 'image_raw:=false')
         self._await(lambda: self._objects('kept') > ABOVE, 'something is kept')
@@ -120,7 +124,7 @@ class Campaign:
         for number, kinds in enumerate(plan, 1):
             for kind in kinds:
                 self._fault(kind)
-            if FULL in kinds:  # on which it may not write down any more that something was delivered
+            if FULL in kinds:  # a full disk, on which a delivery may not be recorded any more
                 self._kill_robot()
                 self.exercised[KILL] += self._open() > 0
             else:
@@ -130,7 +134,7 @@ class Campaign:
             self._wire.set(PASS)
             if self._rng.random() < AT_THE_START:
                 self._node = self._new_node()
-                time.sleep(self._rng.uniform(0.0, 2.0))  # the moment of death, not a wait for anything
+                time.sleep(self._rng.uniform(0.0, 2.0))  # a random life span, not a wait for a condition
                 self._kill_robot()
             self._start()
             progress(f'{number} kills, {self._served()} requests served, {self._open()} open: {", ".join(kinds)}')
@@ -143,7 +147,7 @@ class Campaign:
         self._node.stop(seconds=WAIT_S)
 
     def _plan(self, kills: int) -> list[list[str]]:
-        """What happens before each kill: every kind, about equally often, but one crowd; a full disk comes last."""
+        """What happens before each kill: every kind about equally often, but one crowd; a full disk comes last."""
         others = [kind for kind in KINDS if kind not in {KILL, CROWD}]
         deck: list[str] = []
         while len(deck) < max(kills, len(others)):
@@ -159,16 +163,16 @@ class Campaign:
             self._exercise(kind, requester.kill)
         elif kind == TOWER:
             self._exercise(kind, self._tower.stop_s3)
-            self._go_on('spooled')
+            self._await_more('spooled')
             self._tower.start_s3()
         elif kind in {REFUSED, HUNG}:
             self._exercise(kind, lambda: self._wire.set(REFUSE if kind == REFUSED else HANG))
-            self._go_on('spooled')
+            self._await_more('spooled')
             self._wire.set(PASS)
         elif kind == FULL:
             self._exercise(kind, self._fill)
             with suppress(AssertionError):
-                self._go_on('evicted', FULL_S)
+                self._await_more('evicted', FULL_S)
         elif kind == EXPIRY:
             self._expire()
         elif kind == CROWD:
@@ -180,7 +184,7 @@ class Campaign:
             self._evict()
 
     def _exercise(self, kind: str, fault: Callable[[], object]) -> None:
-        """The fault, at a moment when requests are open: those that are so after it count."""
+        """The fault, at a moment when requests are open: those still open after it count."""
         target = self._objects('delivered') + self._rng.randrange(12)
         self._await(lambda: self._objects('delivered') >= target and self._open() > 1, f'requests are open: {kind}')
         fault()
@@ -192,19 +196,21 @@ class Campaign:
         self.unbalanced += [f'after kill {self.exercised[KILL]}: {line}' for line in found]
 
     def _make_requester(self) -> subprocess.Popen[bytes]:
-        """One that has made a request, and goes on to make more."""
+        """A requester that has sent a request, and continues."""
         name, requester = f'r{len(self._requesters)}-', self._ask(threads=1, count=1000)
-        self._await(lambda: any(each['by'].startswith(name) for said in self.asked().values() for each in said), 'one asks')
+        self._await(
+            lambda: any(each['by'].startswith(name) for reported in self.asked().values() for each in reported), 'one asks'
+        )
         return requester
 
     def _fill(self) -> None:
-        """Take all that is left of the disk, until the next kill."""
+        """Fill the disk until the next kill."""
         with suppress(OSError), self._filler.open('wb', buffering=0) as file:
             while file.write(bytes(64 << 10)):
                 pass
 
     def _expire(self) -> None:
-        """Ask for everything, and cut the wire when some of them have come, until the request is over."""
+        """Request everything, and cut the wire after some of it has arrived, until the request has ended."""
         for attempt in range(TRIES):
             self._await(lambda: self._objects('kept') > MUCH, 'much is kept')
             name = self._ask_here(round(EXPIRY_S * (attempt + 1) * SECOND))
@@ -218,14 +224,14 @@ class Campaign:
                 return
 
     def _evict(self) -> None:
-        """Ask a robot that does not hear it, and has to let things go before it does."""
+        """Send a request to a robot that does not receive it, and that must evict objects before it does."""
         for _ in range(TRIES):
             self._await(lambda: self._objects('kept') > ABOVE and self._open() > 0, 'something is kept')
             self._wire.set(REFUSE)
             self._kill_robot()
             name = self._ask_here(3600 * SECOND)
             self._start(NO_ROOM)
-            self._go_on('evicted')
+            self._await_more('evicted')
             is_open = self._open() > 0
             self._wire.set(PASS)
             self._await(lambda name=name: self._is_over(name), 'what is gone is answered')
@@ -236,32 +242,32 @@ class Campaign:
                 self.exercised[EVICTION] += 1
                 return
 
-    def _go_on(self, state: str, seconds: float = WAIT_S) -> None:
-        """Until so many more objects are in that state."""
+    def _await_more(self, state: str, seconds: float = WAIT_S) -> None:
+        """Wait until this many more objects are in that state."""
         target = self._objects(state) + ABOVE
         self._await(lambda: self._objects(state) >= target, f'more are {state}', seconds)
 
-    # -- what is asked for, and what the robot says of it ----------------------------------------------------------
+    # -- requests and the robot's answers --------------------------------------------------------------------------
 
     def asked(self) -> dict[str, list[dict[str, Any]]]:
-        """Request -> what those wrote down who asked for it."""
+        """Request -> what its requester recorded."""
         found: dict[str, list[dict[str, Any]]] = {}
         self.failed = 0
-        if not self._said.exists():
+        if not self._record.exists():
             return found
-        for line in self._said.read_text(encoding='utf-8').splitlines():
+        for line in self._record.read_text(encoding='utf-8').splitlines():
             try:
-                said = json.loads(line)
+                reported = json.loads(line)
             except ValueError:  # its writer was killed
                 continue
-            self.failed += 'failed' in said
-            if 'id' in said:
-                found.setdefault(said['id'], []).append(said)
+            self.failed += 'failed' in reported
+            if 'id' in reported:
+                found.setdefault(reported['id'], []).append(reported)
         return found
 
     def _ask(self, *, threads: int, count: int) -> subprocess.Popen[bytes]:
-        """One in three feels the outages of the robot."""
-        command = [sys.executable, '-m', 'torture._requester', ROBOT, str(self._said), f'r{len(self._requesters)}', str(count),
+        """One in three is affected by the robot's outages."""
+        command = [sys.executable, '-m', 'torture._requester', ROBOT, str(self._record), f'r{len(self._requesters)}', str(count),
                    str(threads), str(self._rng.randrange(1 << 30))]  # fmt: skip
         environ = {**os.environ, **(self._environ if self._rng.random() < 1 / 3 else self._tower.environment())}
         with (self._folder / 'requesters.log').open('ab') as log:
@@ -269,19 +275,19 @@ class Campaign:
         return self._requesters[-1]
 
     def _ask_here(self, expiry_ns: int) -> str:
-        """For all that is kept."""
+        """For everything that is kept."""
         now_ns = time.time_ns()
         want = KeptFilter(since_ns=now_ns - 3600 * SECOND, until_ns=now_ns)
         seen = pull.kept(self._source, ROBOT, want, Findings(lambda _: None))['key'].to_pylist()
         with closing(S3Store(self._tower.store_settings(), UploadSettings())) as store:
             store.open()
             asked = pull.put_request(store, self._source, ROBOT, want, by='here', priority=0, expiry_ns=expiry_ns)
-        with self._said.open('a', encoding='utf-8') as file:
+        with self._record.open('a', encoding='utf-8') as file:
             file.write(json.dumps({'id': asked.id, 'by': 'here', 'made_ns': asked.made_ns, 'keys': seen}) + '\n')
         return asked.id
 
     def _await(self, condition: Callable[[], bool], what: str, seconds: float = WAIT_S) -> None:
-        """Meanwhile others ask, so that requests are open."""
+        """Start other requesters while waiting, so that requests are open."""
 
         def looked() -> bool:
             time.sleep(0.1)
@@ -296,7 +302,7 @@ class Campaign:
         self._await(lambda: self._served() >= target, f'{count} more requests are served')
 
     def _rows(self, query: str, *values: str) -> list[tuple[Any, ...]]:
-        """Of the robot's index, which is left as it is, whether the robot lives or not."""
+        """From the robot's index, without changing it, whether the robot runs or not."""
         with closing(sqlite3.connect(f'file:{self.home}/spool/index.db?mode=ro', uri=True, timeout=60.0)) as db:
             return db.execute(query, values).fetchall()
 
@@ -313,7 +319,7 @@ class Campaign:
         return bool(self._rows("SELECT * FROM requests WHERE id = ? AND state <> 'active'", request))
 
     def _has(self, request: str, outcome: str) -> bool:
-        """Whether that became of any object of a request."""
+        """Whether any object of a request had this outcome."""
         return bool(self._rows('SELECT * FROM requested WHERE request = ? AND outcome = ? LIMIT 1', request, outcome))
 
     def _objects(self, state: str) -> int:
@@ -326,10 +332,10 @@ class Campaign:
 
     def _start(self, more: dict[str, Any] | None = None) -> None:
         self._node = self._new_node(more)
-        self._node.said('logging ', WAIT_S)
+        self._node.await_log('logging ', WAIT_S)
 
     def _await_last_answers(self) -> None:
-        made = {name: max(each['made_ns'] for each in said) for name, said in self.asked().items()}
+        made = {name: max(each['made_ns'] for each in reported) for name, reported in self.asked().items()}
 
         def are_answered() -> bool:
             for name, made_ns in list(made.items()):
@@ -341,8 +347,8 @@ class Campaign:
         until(are_answered, lambda: f'{len(made)} requests are answered: {sorted(made)[:3]} {self._node.log[-2000:]}', WAIT_S)
 
 
-def judge(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any], list[Bar]]:
-    """What was found."""
+def audit(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any], list[Bar]]:
+    """The results and bars."""
     wrong: dict[str, list[str]] = {name: [] for name in (
         'unbalanced', 'unanswered or contradictory', 'seen and neither stored nor accounted for', 'not what was spooled',
         'cut out of slices and not their messages',
@@ -403,7 +409,7 @@ def _answers(campaign: Campaign, source: Bucket, store: S3Store, in_store: set[s
             'found that some is gone': bool(answer.gone) or bool(answer.lost),
             'expired or taken back in the middle': answer.state in {'expired', 'cancelled'} and 'delivered' in outcomes,
         })  # fmt: skip
-        # What a request that is over did not get may go from then on, before the last answer can be made.
+        # Objects that an ended request did not get may be evicted from then on, before the last answer.
         is_over = set(outcomes) <= {'delivered', 'quarantined', *(() if answer.state == 'done' else ('unsent', 'evicted'))}
         went_early = answer.state == 'expired' and any(each.when and each.when < answer.expires for each in answer.lost)
         if not is_over or went_early or sum(outcomes.values()) != answer.objects:
@@ -419,7 +425,7 @@ def _answers(campaign: Campaign, source: Bucket, store: S3Store, in_store: set[s
 
 
 def _miscut(campaign: Campaign, store: S3Store, answer: RequestAnswer, slices: set[str]) -> list[str]:
-    """Slices of which a request wanted a part that is not in the bags that were cut for it; as far as they are kept still."""
+    """Slices with a requested part that is missing in the bags cut for it, if they are still kept."""
     wanted = MessageFilter(answer.want.get('since_ns', 0), answer.want.get('until_ns', 1 << 62), lambda _: True)
     there = Counter[tuple[str, int, bytes]]()
     for bag in answer.bags:
@@ -449,7 +455,7 @@ def _rows(source: Bucket, in_store: set[str], folder: str) -> list[dict[str, Any
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line."""
-    given = asked_kills(parser('keep', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
+    given = parse_kills(parser('keep', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     try:
         return _run(given)
     except NotAllowed:
@@ -468,7 +474,7 @@ def _run(given: argparse.Namespace) -> int:
                     campaign.run(given.kills)
                 finally:
                     processes.end()
-            figures, bars = judge(campaign, tower, given.kills)
+            figures, bars = audit(campaign, tower, given.kills)
         if not given.json:
             print(json.dumps(figures, indent=1))
         code = verdict(figures, bars, as_json=given.json)

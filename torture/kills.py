@@ -1,7 +1,8 @@
-"""Kills the node with SIGKILL at random points under full load, again and again, with the store up and down.
+"""Kills the node repeatedly with SIGKILL at random points under full load, with the store up and down.
 
-The simulated Go2 publishes at its full rates, all of it is stored, a witness writes down what was published. Afterwards
-every object of the store is compared with it, and what is missing must belong to a kill and be as little as promised.
+The simulated Go2 publishes at its full rates, everything is stored, a witness records what was published. Afterwards every object
+of
+the store is compared with it, and missing messages must belong to a kill and be within the promised limit.
 """
 
 from __future__ import annotations
@@ -26,34 +27,34 @@ from shadowhound_tower.embedded import Tower
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
 from torture._kill_audit import BEST_EFFORT, Audit, Heard, Kill, audit
 
 KILLS: Final = 100
 SHORT_KILLS: Final = 5
 ROBOT: Final = 'thor'
 AT_THE_START: Final = 0.2
-"""Share of the nodes that are killed before they listen or soon after: in their imports, recovery, discovery."""
+"""Share of the nodes that are killed before they listen or soon after: during imports, recovery, discovery."""
 START_S: Final = (0.1, 2.5)
 UP_S: Final = (0.3, 4.0)
 STORE_CHANGES: Final = 0.4
-"""How often the store changes from one kill to the next; half of the time it is there."""
+"""How often the store changes between kills; half of the time it is up."""
 DELIVER_S: Final = 300.0
 PARAMETERS: Final[dict[str, Any]] = {
     **{f'{name}.rate_hz': 0.0 for name in ('camera', 'lidar', 'odom', 'lowstate')},
     'odom.batch_s': 1.0, 'lowstate.batch_s': 1.0,
     'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
 }  # fmt: skip
-"""Every message is stored; and a store that is back is noticed within the life of a node."""
+"""Every message is stored; and a store that is up again is detected within the life of a node."""
 READY: Final = re.compile(r'\[(\d+\.\d+)\].*: logging ')
 
 
 @dataclass(slots=True)
 class Run:
-    """What happened, before anybody looked at the data."""
+    """What happened, before the data is audited."""
 
     kills: list[Kill]
-    said: dict[str, int]
+    reported: dict[str, int]
     ledger: dict[str, Any]
     unbalanced: list[str]
     index: Path
@@ -61,7 +62,7 @@ class Run:
 
 
 class Killer:
-    """One robot, one witness, one node after the other. Life: New; run once."""
+    """One robot, one witness, one node after the other. Lifecycle: New; run once."""
 
     def __init__(self, processes: Processes, wire: Wire, environ: dict[str, str], rng: random.Random) -> None:
         self._processes, self._wire, self._environ, self._rng = processes, wire, environ, rng
@@ -71,7 +72,7 @@ class Killer:
 
     def run(self, kills: int) -> Run:
         recording = self._processes.folder / 'witness'
-        self._start().said('logging ')
+        self._start().await_log('logging ')
         witness = self._processes.witness(TYPES, recording, best_effort=BEST_EFFORT)
         sim = self._processes.sim('image_raw:=false')
         until(lambda: self._nodes[0].topic('/imu').get('received'), 'the first messages are received')
@@ -88,33 +89,33 @@ class Killer:
         return self._finish(sim, witness, recording)
 
     def _finish(self, sim: Process, witness: Process, recording: Path) -> Run:
-        """The last node lives, delivers all and stops."""
+        """The last node runs, delivers everything and stops."""
         node = self._nodes[-1]
-        node.said('logging ')
+        node.await_log('logging ')
         before = node.topic('/imu')['received']
         node.received('/imu', before + 200, 30.0)
         sim.signal(signal.SIGINT)
-        said = published(sim)
+        reported = published(sim)
         progress('all that is left is delivered')
         node.delivered(1, DELIVER_S)
-        said_last = node.stop(seconds=60.0)
+        last_report = node.stop(seconds=60.0)
         witness.signal(signal.SIGTERM)
         witness.wait()
         ready = [_ready(node) for node in self._nodes[1:]]
         kills = [Kill(kill.at, when) for kill, when in zip(self._kills, ready, strict=True)]
-        return Run(kills, said, said_last, self._unbalanced, node.home / 'spool' / 'index.db', recording)
+        return Run(kills, reported, last_report, self._unbalanced, node.home / 'spool' / 'index.db', recording)
 
     def _start(self) -> Node:
         self._nodes.append(self._processes.node(self._environ, PARAMETERS, ready=False))
         return self._nodes[-1]
 
     def _live(self) -> None:
-        """Let the node come as far as chance has it."""
+        """Let the node run for a random time."""
         node, rng = self._nodes[-1], self._rng
         if rng.random() < AT_THE_START and self._kills:
-            time.sleep(rng.uniform(*START_S))  # the moment of death, not a wait for anything
+            time.sleep(rng.uniform(*START_S))  # a random life span, not a wait for a condition
         else:
-            node.said('logging ')
+            node.await_log('logging ')
             time.sleep(rng.uniform(*UP_S))
 
     def _kill(self) -> None:
@@ -130,7 +131,7 @@ class Killer:
 
 
 def _publishes(sim: Process, recording: Path) -> None:
-    """Wait until the witness hears more of the robot: else the nodes to come would have nothing to lose."""
+    """Wait until the witness receives more from the robot: otherwise the next nodes would have nothing to lose."""
     before = recording.stat().st_size
     until(lambda: recording.stat().st_size > before,
           lambda: f'the witness hears the robot, whose exit code is {sim.popen.poll()}')  # fmt: skip
@@ -144,7 +145,7 @@ def _ready(node: Node) -> float:
 
 @contextmanager
 def running(folder: Path) -> Iterator[Processes]:
-    """Processes in a domain of their own; whatever happens, none of them stays."""
+    """Processes in a separate domain; none keeps running, whatever happens."""
     with free_domain() as domain:
         processes = Processes(folder, domain, ROBOT)
         try:
@@ -154,7 +155,7 @@ def running(folder: Path) -> Iterator[Processes]:
 
 
 def campaign(folder: Path, kills: int, seed: int) -> tuple[Run, Audit]:
-    """Run and judge; ``folder`` needs some 10 MB a second."""
+    """Run and audit; ``folder`` needs some 10 MB/s."""
     with Tower(folder / 'tower') as tower:
         with Wire(tower.endpoint_url) as wire, running(folder) as processes:
             environ = tower.environment() | {'AWS_ENDPOINT_URL': wire.url}
@@ -163,7 +164,7 @@ def campaign(folder: Path, kills: int, seed: int) -> tuple[Run, Audit]:
         store = S3Store(tower.store_settings(), UploadSettings())
         store.open()
         try:
-            found = audit(Heard(run.recording), run.said, run.ledger, run.index, store, ROBOT, run.kills)
+            found = audit(Heard(run.recording), run.reported, run.ledger, run.index, store, ROBOT, run.kills)
         finally:
             store.close()
     found.wrong['unbalanced'] += run.unbalanced
@@ -183,8 +184,8 @@ def print_losses(table: dict[str, dict[str, float]]) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
-    given = asked_kills(parser('kills', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
+    """The campaign; 0 if all requirements were met."""
+    given = parse_kills(parser('kills', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     began = time.monotonic()
     with workshop(given) as shop:
         run, found = campaign(shop.folder, given.kills, given.seed)

@@ -1,9 +1,11 @@
-"""Ingests, compacts and queries a lake while robots deliver rows and processes are killed: every row is there exactly once.
+"""Ingests, compacts and queries a lake while robots deliver rows and processes are killed: every row must be there exactly once.
 
 An embedded Tower with a bucket ``lake``; a writer delivers row files of several robots, some rows twice. Two ingesters add them,
-merge files and expire row files; each is killed (SIGKILL) at random moments and started again, and the S3 server is stopped and
-started. All the time a reader queries: every row delivered before its query began must be in the answer, and no row twice. At the
-end the tables alone must have what was delivered.
+merge files and expire row files; each is killed (SIGKILL) at random moments and restarted, and the S3 server is stopped and
+started.
+A reader queries all the time: every row delivered before its query started must be in the answer, and no row twice. At the end
+the
+tables alone must have everything delivered.
 """
 
 from __future__ import annotations
@@ -34,17 +36,17 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import ingest
 from shadowhound_data_logger.lake.tables import OBJECT_ROWS, Tables, answer, engine
 from shadowhound_data_logger.stores import open_store
-from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
 
 KILLS: Final = 100
 SHORT_KILLS: Final = 12
 ROBOTS: Final = ('thor', 'tachi', 'odin')
 ROWS: Final = 12
 REPEATED: Final = 3
-"""Rows of the file before, which each file has again."""
+"""Rows of the previous file that each file repeats."""
 EXPIRE_S: Final = 20.0
 SERVER_EVERY: Final = 10
-"""After so many kills the server is stopped for a moment, too."""
+"""After this many kills the server is stopped for a moment, too."""
 INGESTER: Final = """
 import sys, time
 from datetime import timedelta
@@ -66,7 +68,7 @@ while True:
 
 
 class Writer(threading.Thread):
-    """Delivers row files of all robots until it is told to end."""
+    """Delivers row files of all robots until it is stopped."""
 
     def __init__(self, tower: Tower, folder: Path) -> None:
         super().__init__(name='writer')
@@ -74,7 +76,7 @@ class Writer(threading.Thread):
         self._folder = folder
         self.over = threading.Event()
         self.delivered: list[str] = []
-        """Keys of objects whose rows are in the store; only ever longer."""
+        """Keys of objects whose rows are in the store; it only grows."""
 
     def run(self) -> None:
         before: dict[str, list[schema.Row]] = {}
@@ -86,7 +88,7 @@ class Writer(threading.Thread):
                 rows = [row('camera', start_ns + second * SECOND, robot) for second in range(ROWS)]
                 try:
                     add_part(store, [*before.get(robot, [])[-REPEATED:], *rows], f'part{number:06d}', self._folder / robot)
-                except DataLoggerError:  # the server is stopped: a robot tries again, too
+                except DataLoggerError:  # the server is stopped: a robot retries, too
                     time.sleep(0.2)
                     continue
                 before[robot] = rows
@@ -95,7 +97,7 @@ class Writer(threading.Thread):
 
 
 class Campaign:
-    """What is killed, and what was found wrong."""
+    """The killed processes, and the problems found."""
 
     def __init__(self, folder: Path, kills: int, seed: int) -> None:
         self._folder, self._kills, self._rng = folder, kills, random.Random(seed)
@@ -131,7 +133,7 @@ class Campaign:
             return self._bars(source, writer)
 
     def _query(self, source: Bucket, writer: Writer, seconds: float) -> None:
-        """Query again and again for so long."""
+        """Query repeatedly for this long."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             before = list(writer.delivered)
@@ -180,8 +182,8 @@ class Campaign:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
-    given = asked_kills(parser('lake', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
+    """The campaign; 0 if all requirements were met."""
+    given = parse_kills(parser('lake', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     began = time.monotonic()
     with workshop(given) as shop:
         campaign = Campaign(shop.folder, given.kills, given.seed)

@@ -1,7 +1,7 @@
-"""Eight hours without the store: what they left is delivered while the robot goes on, evenly, and at the store's own pace.
+"""Eight hours without the store: the backlog is delivered while the robot continues, fairly, and at the store's own pace.
 
-The backlog is made directly into a spool, in the proportions and sizes of the default profile: 40,000 objects unless told
-otherwise (eight hours of it are 175,680). A process of its own delivers it as the node does, while new objects arrive.
+The backlog is created directly in a spool, in the proportions and sizes of the default profile: 40,000 objects by default (eight
+hours of it are 175,680). A separate process delivers it as the node does, while new objects arrive.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ FLAT_MB: Final = 16.0
 MAX_MB: Final = 200.0
 RATE: Final = 0.8
 LIVE_S: Final = 10.0
-"""Within this an object that is made meanwhile is in the store, with few exceptions."""
+"""An object that is made during the drain must be in the store within this, with few exceptions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """One object, as the store confirmed it."""
+    """One object, as confirmed by the store."""
 
     at_s: float
     sensor: str
@@ -57,7 +57,7 @@ class Delivery:
 
 @dataclass(frozen=True, slots=True)
 class Drain:
-    """A backlog that was delivered."""
+    """A delivered backlog."""
 
     ticks: list[dict[str, float]]
     deliveries: list[Delivery]
@@ -69,12 +69,12 @@ class Drain:
 
     @property
     def rate(self) -> float:
-        """Objects a second, old and new."""
+        """Objects per second, old and new."""
         return self.ticks[-1]['delivered'] / self.seconds
 
 
 def fill(root: Path, count: int) -> None:
-    """The backlog, without the syncing that is not what is tried here."""
+    """Create the backlog, without syncs, which are not tested here."""
     spool = Spool(root, SpoolSettings(min_free_bytes=0, max_bytes=1 << 40), SystemClock.of_this_machine(), 'thor')
     with mock.patch('os.fsync'):
         spool.open()
@@ -87,13 +87,13 @@ def fill(root: Path, count: int) -> None:
 
 
 def objects_of_the_profile(count: int) -> Iterator[DataObject]:
-    """In the order of time."""
+    """In order of time."""
     names = itertools.islice(arrivals(float(count)), count)
     return (make(sensor, f'{number:06d}') for number, (_, sensor) in enumerate(names))
 
 
 def warm_up(folder: Path, tower: Tower) -> None:
-    """The first put makes the bucket and the server's volumes."""
+    """The first put creates the bucket and the server's volumes."""
     spool = Spool(folder, SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), 'thor')
     spool.open()
     with closing(open_store(tower.store_settings(), UploadSettings())) as store:
@@ -102,7 +102,7 @@ def warm_up(folder: Path, tower: Tower) -> None:
 
 
 def deliver(folder: Path, environ: dict[str, str]) -> Drain:
-    """In a process of its own, whose memory is looked at."""
+    """In a separate process, whose memory is measured."""
     log = folder / 'deliveries'
     command = [sys.executable, '-m', 'torture._drainer', str(folder), str(log)]
     ticks = []
@@ -122,7 +122,7 @@ def deliver(folder: Path, environ: dict[str, str]) -> Drain:
 
 @contextmanager
 def bare_rates(folder: Path, tower: Tower, count: int) -> Iterator[list[float]]:
-    """The bare rate of the store, objects a second, before and after."""
+    """The bare rate of the store, objects per second, before and after."""
     rates: list[float] = []
     for turn in range(2):
         objects = [make(sensor, f'bare-{turn}-{number:06d}') for number, (_, sensor) in enumerate(
@@ -134,7 +134,7 @@ def bare_rates(folder: Path, tower: Tower, count: int) -> Iterator[list[float]]:
 
 
 def bars(drain: Drain, bare_rate: float, count: int) -> tuple[dict[str, Any], list[Bar]]:
-    """What was found, and what must hold of it."""
+    """The results, and the requirements."""
     old = [delivery for delivery in drain.deliveries if not delivery.live]
     place = {sensor: statistics.median(n for n, each in enumerate(old) if each.sensor == sensor) / len(old) for sensor in
              {each.sensor for each in old}}  # fmt: skip
@@ -164,7 +164,7 @@ def bars(drain: Drain, bare_rate: float, count: int) -> tuple[dict[str, Any], li
 
 
 def campaign(folder: Path, count: int) -> tuple[dict[str, Any], list[Bar]]:
-    """Fill, drain, judge."""
+    """Fill, drain, audit."""
     began = time.monotonic()
     fill(folder / 'spool', count)
     progress(f'{count} objects are spooled after {time.monotonic() - began:.0f} s')
@@ -177,9 +177,9 @@ def campaign(folder: Path, count: int) -> tuple[dict[str, Any], list[Bar]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     options = parser('long_outage', __doc__ or '')
-    options.add_argument('--objects', type=int, default=0, help=f'how many wait, {OBJECTS} unless told')
+    options.add_argument('--objects', type=int, default=0, help=f'how many wait (default {OBJECTS})')
     given = options.parse_args(argv)
     count = given.objects or (SHORT_OBJECTS if given.short else OBJECTS)
     with workshop(given) as shop:

@@ -1,12 +1,15 @@
-"""Loses messages on purpose and holds the ledger to what was sent, message by message, on Fast DDS and on Cyclone DDS.
+"""Loses messages on purpose and compares the ledger with what was sent, message by message, on Fast DDS and on Cyclone DDS.
 
-Publishers of both, alone and several on a topic, RELIABLE and BEST_EFFORT, small and large, number what they send.
-Meanwhile the node is stopped for seconds, starved, and killed and started again, and a publisher is killed and replaced, once
-while the node is not there. Every message that the node keeps is stored, so a gap in the numbers of the store is what was
-missed, or what a kill took from open batches (``dropped: restart``). Where the ledger says ``exact``, all its figures are those
-of the numbers. A second node is told no numbers: it must not claim that nothing was lost, and what it estimates must be close.
+Publishers of both, one and several per topic, RELIABLE and BEST_EFFORT, small and large, number their messages. The node is
+stopped
+for seconds, starved, and killed and restarted, and a publisher is killed and replaced, once while the node is not running. Every
+message that the node keeps is stored, so a gap in the numbers of the store is what was missed, or what a kill took from open
+batches
+(``dropped: restart``). If the ledger is ``exact``, all its counts must be those of the numbers. A second node gets no numbers: it
+must
+not claim that nothing was lost, and its estimates must be close.
 
-What a publisher sends at its very end, after which nothing of it arrives, is in no gap and in no ledger: it is told here.
+Messages that a publisher sends at its very end, after which none arrives, are in no gap and in no ledger: they are reported here.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from domains import free_domain
-from e2e.numbered import told
+from e2e.numbered import parse_numbered
 from e2e.processes import Node, Processes, Publisher, until
 
 from shadowhound_data_logger.spool.estimator import RESTART
@@ -44,28 +47,28 @@ class Taken(model.Taken):
         return super().__new__(cls, cdr, source_ns, None, None, received_ns)
 model.Taken = Taken
 """
-"""What a node sees of messages that nobody numbers; rclpy is not imported before the node has chosen a middleware."""
+"""A node without message numbers; rclpy is not imported before the node has chosen a middleware."""
 STOPPED_S: Final = 3.0
 STARVED_S: Final = 4.5
 STARVED_TURN_S: Final = 0.05
 STARVED_EACH_S: Final = 1.5
-"""A starved node has its turn so seldom: more comes between two than buffers hold."""
+"""A starved node runs so rarely that more messages arrive in between than buffers hold."""
 KILLED_S: Final = 1.0
 STEADY_S: Final = 2.0
-"""Between two disturbances; at the beginning the rhythm of a topic has to be learned, 200 intervals of it."""
+"""Between two disturbances; at the start a topic's rate must be learned, 200 intervals of it."""
 LEARN_S: Final = 25.0
 SHORT_LEARN_S: Final = 6.0
-"""Enough for what is small: what is large comes at a fifth of its rate."""
+"""Enough for small messages: large ones have a fifth of their rate."""
 BATCH_S: Final = 0.5
 OPEN_S: Final = BATCH_S + 1.5
-"""A kill takes at most what was received for so long; 0.3 s beyond the batch where the machine has nothing else to do."""
+"""Maximum age of messages lost in a kill; 0.3 s beyond the batch on an idle machine."""
 ESTIMATE: Final = 0.05
-"""How far an estimate may be off, and so many messages for each disturbance besides."""
+"""Maximum relative error of an estimate, plus this many messages for each disturbance."""
 ESTIMATE_SLACK: Final = 1
 
 
 Sent = dict[tuple[str, str], 'int | None']
-"""(topic, name of the publisher) -> how many messages it sent; None where it was killed: that is not known then."""
+"""(topic, name of the publisher) -> number of messages sent; None if it was killed, because that is unknown then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +80,7 @@ class Stream:
     size: int
     period_s: float
     by: tuple[str, ...]
-    """Who publishes on it: keys of ``Robot.publishers``."""
+    """Its publishers: keys of ``Robot.publishers``."""
 
 
 PUBLISHERS: Final = ('fast', 'cyclone', 'mortal')
@@ -100,7 +103,7 @@ class Robot:
     sent: Sent = field(default_factory=dict)
 
     def start(self, who: str, generation: int, *, matched: bool = True) -> None:
-        """With ``matched`` its first messages have a listener."""
+        """With ``matched`` its first messages have a subscriber."""
         publisher = self.publishers[who] = self.processes.publisher(cyclone=who != 'fast')
         self.names[who] = f'{who}{generation}'
         for stream in self.of(who):
@@ -111,14 +114,14 @@ class Robot:
             publisher.begin_numbered(stream.topic, self.names[who], stream.size, stream.period_s)
 
     def replace(self, who: str, generation: int) -> None:
-        """Kill it in the middle of what it does, and start another one."""
+        """Kill it at work, and start another one."""
         self.publishers[who].kill()
         for stream in self.of(who):
             self.sent[stream.topic, self.names[who]] = None
         self.start(who, generation)
 
-    def halt(self, who: str) -> None:
-        """What it has sent now is all that it ever sends."""
+    def stop(self, who: str) -> None:
+        """What it has sent by now is all that it ever sends."""
         for stream in self.of(who):
             self.sent[stream.topic, self.names[who]] = self.publishers[who].halt_numbered(stream.topic)
 
@@ -129,19 +132,19 @@ class Robot:
 
 @dataclass(slots=True)
 class Nodes:
-    """The node, and one that is told no numbers; each disturbance is for both."""
+    """The node, and one without message numbers; each disturbance affects both."""
 
     processes: Processes
     start: Mapping[str, Callable[[], Node]]
     running: dict[str, Node] = field(default_factory=dict)
 
     def open(self) -> None:
-        """Start them; returns when each topic is heard."""
+        """Start them; returns when each topic is received."""
         self.running = {name: start() for name, start in self.start.items()}
-        self.heard()
+        self.await_received()
 
-    def heard(self) -> None:
-        """Wait until more has come of each topic."""
+    def await_received(self) -> None:
+        """Wait until more messages of each topic have arrived."""
         for node in self.running.values():
             before = {stream.topic: node.topic(stream.topic).get('received', 0) for stream in STREAMS}
             for topic, count in before.items():
@@ -153,7 +156,7 @@ class Nodes:
         self._signal(signal.SIGCONT)
 
     def starved(self) -> None:
-        """As by others that have all of the cores: a turn now and then."""
+        """As if other processes used all cores: a time slice now and then."""
         end = time.monotonic() + STARVED_S
         while time.monotonic() < end:
             self._signal(signal.SIGSTOP)
@@ -168,7 +171,7 @@ class Nodes:
         self.open()
 
     def end(self) -> dict[str, Any]:
-        """As somebody asks them to, which loses nothing that was received; the ledger of each."""
+        """Stop them cleanly, which loses no received message; returns the ledger of each."""
         return {name: node.stop() for name, node in self.running.items()}
 
     def _signal(self, number: int) -> None:
@@ -178,7 +181,7 @@ class Nodes:
 
 @dataclass(slots=True)
 class Truth:
-    """What the numbers in the store of a node say of a topic."""
+    """The numbers of a topic in the store of a node."""
 
     stored: int = 0
     absent: int = 0
@@ -186,7 +189,7 @@ class Truth:
     gaps: int = 0
     twice: int = 0
     at_the_end: int = 0
-    """After the last one, of publishers of which it is known how many they sent."""
+    """After the last one, of publishers whose count is known."""
 
     @property
     def published(self) -> int:
@@ -200,7 +203,7 @@ def truth(home: Path, sent: Sent) -> dict[str, Truth]:
         if '_ledger' not in path.parts:
             document = json.loads(path.read_bytes())
             for sample in document['samples']:
-                name, number = told(sample['data'])
+                name, number = parse_numbered(sample['data'])
                 numbers.setdefault((document['topic'], name), []).append(number)
     found = {stream.topic: Truth() for stream in STREAMS}
     for (topic, name), came in numbers.items():
@@ -217,7 +220,7 @@ def truth(home: Path, sent: Sent) -> dict[str, Truth]:
 
 @dataclass(slots=True)
 class Found:
-    """What the audit says; ``wrong`` by bar."""
+    """The result of the audit; ``wrong`` by bar."""
 
     done: Counter[str]
     """Disturbances."""
@@ -225,24 +228,24 @@ class Found:
     grades: dict[str, Counter[str]] = field(default_factory=dict)
     truths: dict[str, dict[str, Truth]] = field(default_factory=dict)
     estimates: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """By topic, what was lost and what was estimated."""
+    """By topic, actual and estimated losses."""
 
-    def say(self, bar: str, text: str, *, holds: bool) -> None:
+    def fail(self, bar: str, text: str, *, holds: bool) -> None:
         self.wrong.setdefault(bar, [])
         if not holds:
             self.wrong[bar].append(text)
 
     def bars(self) -> list[Bar]:
-        return [Bar(what, not said, '; '.join(said[:3])) for what, said in self.wrong.items()]
+        return [Bar(what, not reported, '; '.join(reported[:3])) for what, reported in self.wrong.items()]
 
 
 def audit(found: Found, who: str, ledger: Mapping[str, Any], truths: Mapping[str, Truth], done: Counter[str]) -> None:
-    """One node's ledger against the numbers in its store."""
+    """Compare one node's ledger with the numbers in its store."""
     found.truths[who] = dict(truths)
     grades = found.grades.setdefault(who, Counter())
     for stream in STREAMS:
         real, row = truths[stream.topic], ledger['topics'].get(stream.topic)
-        found.say('every topic was heard', f'{who} {stream.topic}', holds=row is not None and real.stored > 0)
+        found.fail('every topic was heard', f'{who} {stream.topic}', holds=row is not None and real.stored > 0)
         if row is None:
             continue
         grades[row['accounting']] += 1
@@ -250,19 +253,19 @@ def audit(found: Found, who: str, ledger: Mapping[str, Any], truths: Mapping[str
         text = f'{who} {stream.topic}: in truth {real}, said { {name: row[name] for name in names} }'
         taken = row['dropped'].get(RESTART, 0)
         most = done['killed'] * len(stream.by) * OPEN_S / stream.period_s
-        found.say('nothing was stored twice', text, holds=not real.twice)
-        found.say('stored is what is in the store', text, holds=row['stored'] == real.stored)
-        found.say('received is stored, or what a kill took', text, holds=row['received'] == real.stored + taken)
-        found.say('a kill takes no more than what is open', text, holds=taken <= most)
+        found.fail('nothing was stored twice', text, holds=not real.twice)
+        found.fail('stored is what is in the store', text, holds=row['stored'] == real.stored)
+        found.fail('received is stored, or what a kill took', text, holds=row['received'] == real.stored + taken)
+        found.fail('a kill takes no more than what is open', text, holds=taken <= most)
         lost = real.absent - taken
         if row['accounting'] == EXACT:
-            found.say('exact: published is what was sent', text, holds=row['published'] == real.published)
-            found.say('exact: missed is what was sent and did not come', text, holds=row['missed'] == lost)
+            found.fail('exact: published is what was sent', text, holds=row['published'] == real.published)
+            found.fail('exact: missed is what was sent and did not come', text, holds=row['missed'] == lost)
         else:
-            found.say('without numbers nobody says "missed 0"', text, holds=row['missed'] is None)
+            found.fail('without numbers nobody says "missed 0"', text, holds=row['missed'] is None)
         if row['missed_estimated'] is not None:
             room = ESTIMATE * lost + ESTIMATE_SLACK * done.total()
-            found.say(f'estimated: within {ESTIMATE:.0%}', text, holds=abs(row['missed_estimated'] - lost) <= room)
+            found.fail(f'estimated: within {ESTIMATE:.0%}', text, holds=abs(row['missed_estimated'] - lost) <= room)
             found.estimates[stream.topic] = lost, row['missed_estimated']
 
 
@@ -277,7 +280,7 @@ def parameters() -> dict[str, Any]:
 
 
 def campaign(folder: Path, rounds: int, rng: random.Random, learn_s: float) -> Found:
-    """Run and judge."""
+    """Run and audit."""
     hidden = folder / 'hidden'
     hidden.mkdir(parents=True)
     (hidden / 'sitecustomize.py').write_text(LEAVE_OUT)
@@ -299,13 +302,13 @@ def campaign(folder: Path, rounds: int, rng: random.Random, learn_s: float) -> F
         audit(found, who, ledger, truth(nodes.running[who].home, robot.sent), done)
     exact = found.truths['numbered'].values()
     figures = {name: sum(getattr(real, name) for real in exact) for name in ('absent', 'at_the_end')}
-    found.say('messages were lost, also at the end of a publisher', f'{figures}', holds=min(figures.values()) > 0)
-    found.say('with numbers every topic is exact', f'{found.grades["numbered"]}', holds=set(found.grades['numbered']) == {EXACT})
+    found.fail('messages were lost, also at the end of a publisher', f'{figures}', holds=min(figures.values()) > 0)
+    found.fail('with numbers every topic is exact', f'{found.grades["numbered"]}', holds=set(found.grades['numbered']) == {EXACT})
     return found
 
 
 def _disturb(nodes: Nodes, robot: Robot, rounds: int, rng: random.Random, learn_s: float) -> Counter[str]:
-    """How often was done what; in the end nothing is on its way any more."""
+    """Counts the disturbances; at the end no message is in flight."""
     for who in PUBLISHERS:
         robot.start(who, 0, matched=False)
     nodes.open()
@@ -316,10 +319,10 @@ def _disturb(nodes: Nodes, robot: Robot, rounds: int, rng: random.Random, learn_
         robot.replace('mortal', done.total() + 1)
 
     def departed() -> None:
-        """The publisher goes, while the node is not there."""
+        """The publisher exits while the node is not running."""
         nodes.end()
         time.sleep(KILLED_S)
-        robot.halt('mortal')
+        robot.stop('mortal')
         robot.publishers['mortal'].kill()
         robot.start('mortal', done.total() + 1, matched=False)
         nodes.open()
@@ -333,16 +336,16 @@ def _disturb(nodes: Nodes, robot: Robot, rounds: int, rng: random.Random, learn_
             disturbances[name]()
             time.sleep(STEADY_S)
             done[name] += 1
-    nodes.heard()
+    nodes.await_received()
     time.sleep(STEADY_S)
     for who in PUBLISHERS:
-        robot.halt(who)
+        robot.stop(who)
     quiet(nodes.running.values())
     return done
 
 
 def quiet(nodes: Collection[Node]) -> None:
-    """Returns once nothing comes to them any more."""
+    """Returns once they receive nothing any more."""
     seen: list[int] = []
 
     def is_quiet() -> bool:
@@ -354,9 +357,9 @@ def quiet(nodes: Collection[Node]) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     options = parser('losses', __doc__ or '')
-    options.add_argument('--rounds', type=int, default=0, help=f'how many of all disturbances, {ROUNDS} unless told')
+    options.add_argument('--rounds', type=int, default=0, help=f'how many of all disturbances (default {ROUNDS})')
     given = options.parse_args(argv)
     rounds = given.rounds or (SHORT_ROUNDS if given.short else ROUNDS)
     progress(f'{rounds} rounds, seed {given.seed}')

@@ -1,9 +1,11 @@
 """Deletes, cuts and overwrites the spool's index under a node, ``bag record`` and a mission agent, while all three are at work.
 
-Afterwards any of them is killed or asked to end, and started again as a supervisor would; so is one that ends by itself. A
-publisher numbers what it sends. At the end each message must be in the store once for each of the three that took it; what is
-not must belong to a death, or be listed with its reason. No object may be overwritten, no bag may lack a manifest or claim more
-than it has, no watermark may cover what is not listed, and each mission must be one run with each of its points and frames.
+Afterwards any of them is killed or stopped, and restarted as by a supervisor; so is one that exits on its own. A publisher
+numbers its
+messages. At the end each message must be in the store once for each of the three that took it; a missing one must belong to the
+exit
+of a process, or be listed with its reason. No object may be overwritten, no bag may lack a manifest or claim more than it has, no
+watermark may cover an unlisted loss, and each mission must be one run with each of its points and frames.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from e2e.bag_reading import Bag, bags, in_slice
-from e2e.numbered import told
+from e2e.numbered import parse_numbered
 from e2e.processes import Node, Process, Processes, Publisher, until
 from e2e.wire import Wire
 from missions.server import Server, complete
@@ -60,15 +62,15 @@ NODE, RECORDER, AGENT, SENDER = 'node', 'recorder', 'agent', 'sender'
 BUCKET: Final = 'sensor-data'
 STREAMS: Final = (Stream('/small', True, 40, 0.02), Stream('/large', True, 20_000, 0.1))
 BESIDE: Final = 'beside'
-"""What the bags of ``bag record`` are called by."""
+"""The name of the bags of ``bag record``."""
 NOTICED_S: Final = (0.0, 3.0)
-"""From a damage to the first death."""
+"""From a damage to the first kill."""
 UNTOUCHED: Final = 0.2
-"""Share of the damages after which nobody is killed."""
+"""Share of the damages after which no process is killed."""
 REOPENED_S: Final = 5.0
-"""How long ``bag record`` may need to open the spool anew once it finds that the index is lost ..."""
+"""How long ``bag record`` may need to open the spool again once it finds that the index is lost ..."""
 FOUND_S: Final = 30.0
-"""... and how long that may take: what is written over may be read late."""
+"""... and how long that may take: overwritten pages may be read late."""
 GO_ON_S: Final = 90.0
 STEADY_S: Final = 1.0
 DELIVER_S: Final = 300.0
@@ -84,9 +86,9 @@ PARAMETERS: Final[dict[str, Any]] = {
 
 
 class Death(NamedTuple):
-    """Since when a process may have recorded in vain, and when the one after it did its work again, ns since 1970.
+    """Since when a process may have recorded in vain, and when the next one did its work again, ns since 1970.
 
-    Where it was ended after a damage, that is since the damage: the index holds what it did in the meantime.
+    If it was stopped after a damage, since the damage: the index has what it did in between.
     """
 
     at_ns: int
@@ -95,7 +97,7 @@ class Death(NamedTuple):
 
 @dataclass(slots=True)
 class Happened:
-    """What was done, and what was seen meanwhile."""
+    """What was done, and what was observed."""
 
     damages: list[tuple[str, int]] = field(default_factory=list)
     deaths: dict[str, list[Death]] = field(default_factory=lambda: {NODE: [], RECORDER: []})
@@ -109,7 +111,7 @@ class Happened:
     published: dict[str, int] = field(default_factory=dict)
 
     def heard(self, data: bytes) -> None:
-        """What goes to the store."""
+        """Count what is sent to the store."""
         self.puts.update(key.decode() for key in _PUT.findall(data))
 
 
@@ -117,7 +119,7 @@ _PUT: Final = re.compile(rb'PUT /([^ ?]+) HTTP/1')
 
 
 class Robot(joined.Killer):
-    """A node, a recorder and an agent in one home. Life: New; run once."""
+    """A node, a recorder and an agent in one home. Lifecycle: New; run once."""
 
     def __init__(self, processes: Processes, environ: dict[str, str], rng: random.Random, store: ObjectStore,
                  happened: Happened) -> None:  # fmt: skip
@@ -127,24 +129,24 @@ class Robot(joined.Killer):
         self._damaged_ns = 0
 
     def run_rounds(self, rounds: int, publisher: Publisher) -> None:
-        self.node.said('logging ')
+        self.node.await_log('logging ')
         self._start_recorder()
         self._start_agent()
         for stream in STREAMS:
             publisher.matched(stream.topic, 2)
             publisher.begin_numbered(stream.topic, 'p', stream.size, stream.period_s)
         for number in range(1, rounds + 1):
-            self._goes_on(time.time_ns())
-            self._sleep(self._rng.uniform(STEADY_S, 2 * STEADY_S))  # a node may notice the last damage only now
+            self._await_progress(time.time_ns())
+            self._sleep(self._rng.uniform(STEADY_S, 2 * STEADY_S))  # a node may detect the last damage only now
             what = self._damage()
             progress(f'{number}: {what}, {self._disturb()}')
-        self._goes_on(time.time_ns())
+        self._await_progress(time.time_ns())
         self._damaged_ns = 0
         for stream in STREAMS:
             self._happened.published[stream.topic] = publisher.halt_numbered(stream.topic)
 
     def finish(self) -> None:
-        """Everything ends as asked; a last node delivers what is left."""
+        """Stop all of them; a last node delivers what is left."""
         recorder = self._recorder
         assert recorder is not None
         recorder.signal(signal.SIGINT)
@@ -153,9 +155,9 @@ class Robot(joined.Killer):
         recorder.kill()
         self._kill_agent()
         self._restart_node(signal.SIGINT)
-        self.node.said('logging ')
+        self.node.await_log('logging ')
 
-    # -- what is done to them ------------------------------------------------------------------------------------------
+    # -- disturbances --------------------------------------------------------------------------------------------------
 
     def _damage(self) -> str:
         index, rng = self.home / 'spool' / 'index.db', self._rng
@@ -177,29 +179,29 @@ class Robot(joined.Killer):
         return what
 
     def _disturb(self) -> str:
-        """Let them live with it, then end some of them."""
+        """Let them run with it, then stop some of them."""
         rng = self._rng
         self._sleep(rng.uniform(*NOTICED_S))
         if rng.random() < UNTOUCHED:
             return 'nobody is killed'
         chosen = [name for name in (NODE, RECORDER, AGENT, SENDER) if rng.random() < 0.5] or [rng.choice((NODE, RECORDER))]
         rng.shuffle(chosen)
-        said = []
+        reported = []
         for name in chosen:
-            self._look()
+            self._restart_exited()
             number = rng.choice((signal.SIGKILL, signal.SIGINT))
             self._happened.killed[f'{name} {number.name}' if name in {NODE, RECORDER} else name] += 1
-            said.append(f'{name} {number.name}')
+            reported.append(f'{name} {number.name}')
             if name == NODE:
                 self._restart_node(number)
             elif name == RECORDER:
                 self._restart_recorder(number)
             else:
                 self._kill({AGENT: joined.AGENT, SENDER: joined.SENDER}[name])
-        return ', '.join(said)
+        return ', '.join(reported)
 
     def _doubtful_ns(self) -> int:
-        """Since when a death that is found now counts."""
+        """The start of the doubtful time for an exit that is found now."""
         return self._damaged_ns or time.time_ns()
 
     def _restart_node(self, number: int) -> None:
@@ -236,8 +238,8 @@ class Robot(joined.Killer):
 
     # -- as a supervisor does ------------------------------------------------------------------------------------------
 
-    def _look(self) -> None:
-        """Start again what ended by itself."""
+    def _restart_exited(self) -> None:
+        """Restart processes that exited on their own."""
         if self.node.popen.poll() is not None:
             self._happened.ended_by_itself[f'node, exit code {self.node.popen.returncode}'] += 1
             self._node_died(self._doubtful_ns())
@@ -256,11 +258,11 @@ class Robot(joined.Killer):
     def _sleep(self, seconds: float) -> None:
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
-            self._look()
+            self._restart_exited()
             time.sleep(min(0.05, seconds))
 
-    def _goes_on(self, since_ns: int) -> None:
-        """Wait until each of them has done more, and start again the one that does not."""
+    def _await_progress(self, since_ns: int) -> None:
+        """Wait until each of them has done more, and restart the one that does not."""
         restart: dict[str, tuple[Callable[[], bool], Callable[[], None]]] = {
             NODE: (lambda: self._stores(since_ns), lambda: self._restart_node(signal.SIGKILL)),
             RECORDER: (lambda: self._records(since_ns), lambda: self._restart_recorder(signal.SIGKILL)),
@@ -275,8 +277,8 @@ class Robot(joined.Killer):
             now_ns = time.time_ns()
             deaths = self._happened.deaths[name]
             self._happened.deaths[name] = [death if death.ready_ns else Death(death.at_ns, now_ns) for death in deaths]
-        size = self._said.stat().st_size
-        if not self._waits(lambda: self._said.stat().st_size > size):
+        size = self._reported.stat().st_size
+        if not self._waits(lambda: self._reported.stat().st_size > size):
             self._happened.hung.append(f'agent after damage {len(self._happened.damages)}')
         self._note_overwritten()
 
@@ -289,7 +291,7 @@ class Robot(joined.Killer):
         return True
 
     def _stores(self, since_ns: int) -> bool:
-        """Whether the store has an object of a later second: what was left of a node before is none of this one's work."""
+        """Whether the store has an object of a later second: leftovers of an earlier node are not its work."""
         name = STREAMS[0].topic.strip('/')
         prefix, first = (
             f'{ROBOT}/{name}/{utc(time.time_ns()):%Y%m%d/%H}',
@@ -312,7 +314,7 @@ class Robot(joined.Killer):
 
 
 def _end(process: Process, number: int) -> None:
-    """SIGINT has a minute, as a service manager gives it."""
+    """SIGINT with a timeout of one minute, as a service manager gives."""
     if number == signal.SIGINT:
         process.signal(number)
         with suppress(Exception):
@@ -322,7 +324,7 @@ def _end(process: Process, number: int) -> None:
 
 @dataclass(slots=True)
 class Found:
-    """What does not hold, by bar, and figures."""
+    """Violations, by bar, and results."""
 
     wrong: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     figures: dict[str, Any] = field(default_factory=dict)
@@ -330,11 +332,11 @@ class Found:
 
 
 Stamps = dict[str, dict[int, int]]
-"""Topic -> number -> stamp of what is stored, ns."""
+"""Topic -> number -> stamp of stored messages, ns."""
 
 
-def of_objects(found: Found, store: ObjectStore, objects: Mapping[str, ObjectInfo]) -> Stamps:
-    """The messages in the sensors' objects; every object's content is what it says."""
+def stamps_in_objects(found: Found, store: ObjectStore, objects: Mapping[str, ObjectInfo]) -> Stamps:
+    """The messages in the sensors' objects; every object's content must match its metadata."""
     stamps: Stamps = {stream.topic: {} for stream in STREAMS}
     folders = tuple(f'{ROBOT}/{stream.topic.strip("/")}/' for stream in STREAMS)
     with ThreadPoolExecutor(READERS) as pool:
@@ -345,15 +347,15 @@ def of_objects(found: Found, store: ObjectStore, objects: Mapping[str, ObjectInf
             elif key.startswith(folders):
                 document = json.loads(body)
                 for sample in document['samples']:
-                    number = told(sample['data'])[1]
+                    number = parse_numbered(sample['data'])[1]
                     if number in stamps[document['topic']]:
                         found.wrong['twice'].append(f'objects {document["topic"]} {number} again in {key}')
                     stamps[document['topic']][number] = sample['stamp_ns']
     return stamps
 
 
-def of_bags(found: Found, stored: Sequence[Bag], who: str) -> Stamps:
-    """The messages in the bags of the node or of the recorder; every bag is what its manifest says."""
+def stamps_in_bags(found: Found, stored: Sequence[Bag], who: str) -> Stamps:
+    """The messages in the bags of the node or of the recorder; every bag must match its manifest."""
     stamps: Stamps = {stream.topic: {} for stream in STREAMS}
     for bag in stored:
         if not bag.manifest:
@@ -366,7 +368,7 @@ def of_bags(found: Found, stored: Sequence[Bag], who: str) -> Stamps:
         own: Stamps = {stream.topic: {} for stream in STREAMS}
         for path in bag.slices:
             for message in in_slice(path):
-                number = told(message.cdr[8:-1].decode())[1]
+                number = parse_numbered(message.cdr[8:-1].decode())[1]
                 if number in stamps[message.topic]:
                     found.wrong['twice'].append(f'{who} {message.topic} {number} again in {path.name}')
                 stamps[message.topic][number] = own[message.topic][number] = message.publish_ns
@@ -375,23 +377,25 @@ def of_bags(found: Found, stored: Sequence[Bag], who: str) -> Stamps:
 
 
 def _claims(found: Found, bag: Bag, own: Stamps) -> None:
-    """No message within a bag is missing without a word about it."""
+    """No message within a bag may be missing without being listed."""
     if not bag.manifest:
         return
-    said = Counter[str]()
+    reported = Counter[str]()
     unknown = False
     for each in bag.manifest['missing']:
         unknown |= each['messages'] is None and 'in memory' not in each['what']
-        said[each['topic'] or ''] += each['messages'] or 0
+        reported[each['topic'] or ''] += each['messages'] or 0
     for topic, stamps in own.items():
         holes = max(stamps) - min(stamps) + 1 - len(stamps) if stamps else 0
         found.looked['holes in bags'] += holes
-        if holes > said[topic] + said[''] and not unknown:
-            found.wrong['claims'].append(f'{bag.folder.name} {topic}: {holes} are missing in it, its manifest says {dict(said)}')
+        if holes > reported[topic] + reported[''] and not unknown:
+            found.wrong['claims'].append(
+                f'{bag.folder.name} {topic}: {holes} are missing in it, its manifest says {dict(reported)}'
+            )
 
 
 def absent(stamps: Stamps, published: Mapping[str, int]) -> dict[str, list[Loss]]:
-    """What is not stored, by topic, from the last message before to the first after; what comes before the first is nobody's."""
+    """Missing messages, by topic, from the last message before to the first after; messages before the first do not count."""
     return {
         topic: [Loss(numbers[one], numbers[two], two - one - 1) for one, two in pairwise(sorted(numbers)) if two > one + 1]
         + ([Loss(numbers[max(numbers)], (1 << 62), published[topic] - max(numbers) - 1)]
@@ -401,7 +405,9 @@ def absent(stamps: Stamps, published: Mapping[str, int]) -> dict[str, list[Loss]
 
 
 def spans(deaths: Iterable[Death], loss_s: float) -> list[tuple[int, int]]:
-    """Times in which messages may be lost without a word, since the accounts died with the index and then the process did."""
+    """Times in which messages may be lost without a record, because the accounts were lost with the index and then the process
+    exited.
+    """
     found: list[tuple[int, int]] = []
     for death in sorted(deaths):
         begin_ns, end_ns = death.at_ns - round(loss_s * SECOND), death.ready_ns + round(DISCOVERY_S * SECOND)
@@ -412,15 +418,15 @@ def spans(deaths: Iterable[Death], loss_s: float) -> list[tuple[int, int]]:
     return found
 
 
-def judge_losses(found: Found, sink: str, lost: Mapping[str, Sequence[Loss]], said: Mapping[str, Sequence[Loss]],
+def audit_losses(found: Found, sink: str, lost: Mapping[str, Sequence[Loss]], reported: Mapping[str, Sequence[Loss]],
                  deaths: Sequence[Death], reopened: Sequence[int] = ()) -> None:  # fmt: skip
-    """What is lost is listed, or of a death; ``reopened`` are times after which a process may have opened the spool anew."""
+    """Losses must be listed, or belong to an exit; ``reopened`` are times after which a process may have reopened the spool."""
     allowed = spans(deaths, LOSS_S + SLACK_S)
     unlisted: list[int] = []
     longest = 0
     for stream in STREAMS:
         near_ns = round(PERIODS * stream.period_s * SECOND)
-        for real, journal in together(lost[stream.topic], said.get(stream.topic, ()), near_ns):
+        for real, journal in together(lost[stream.topic], reported.get(stream.topic, ()), near_ns):
             count, known = (sum(each.count for each in group) for group in (real, journal))
             found.looked[f'{sink}: lost'] += count
             found.looked[f'{sink}: listed'] += min(count, known)
@@ -445,16 +451,18 @@ def judge_losses(found: Found, sink: str, lost: Mapping[str, Sequence[Loss]], sa
 
 
 def stated(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, list[Loss]]]:
-    """Losses by sink and topic, of the gap parts in the store."""
-    said: dict[str, dict[str, list[Loss]]] = defaultdict(lambda: defaultdict(list))
+    """Losses by sink and topic, from the gap parts in the store."""
+    reported: dict[str, dict[str, list[Loss]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         if row['what'] == GAP and row['count'] and row['from_ns'] is not None:
-            said[row['sink']][row['topic']].append(Loss(row['from_ns'], row['to_ns'], row['count'], row['cause'] or row['kind']))
-    return said
+            reported[row['sink']][row['topic']].append(
+                Loss(row['from_ns'], row['to_ns'], row['count'], row['cause'] or row['kind'])
+            )
+    return reported
 
 
-def judge_watermarks(found: Found, rows: Sequence[Mapping[str, Any]], lost: Mapping[str, Mapping[str, Sequence[Loss]]]) -> None:
-    """No watermark covers a loss that no row lists."""
+def audit_watermarks(found: Found, rows: Sequence[Mapping[str, Any]], lost: Mapping[str, Mapping[str, Sequence[Loss]]]) -> None:
+    """No watermark may cover a loss that no row lists."""
     for sink, topics in lost.items():
         for topic, losses in topics.items():
             own = [row for row in rows if (row['sink'], row['topic']) == (sink, topic)]
@@ -479,7 +487,7 @@ WHAT: Final = {
 
 
 def audit(found: Found, happened: Happened, tower: Tower, wire: Wire, robot: Robot, store: ObjectStore, folder: Path) -> None:
-    """Everything that the store has, against what was published and done."""
+    """Compare everything in the store with what was published and done."""
     objects = joined.stored(tower)
     found.looked['objects'] = len(objects)
     stored = bags(store, ROBOT, folder / 'bags')
@@ -487,22 +495,22 @@ def audit(found: Found, happened: Happened, tower: Tower, wire: Wire, robot: Rob
     own = [bag for bag in stored if not bag.folder.name.startswith(f'{BESIDE}_')]
     beside = [bag for bag in stored if bag.folder.name.startswith(f'{BESIDE}_')]
     rows = lake_gaps.newest(Bucket(tower.store_settings(), BUCKET), robot=ROBOT).to_pylist()
-    said = stated(rows)
+    reported = stated(rows)
     in_bags: dict[str, list[Loss]] = defaultdict(list)
     with suppress(SpoolError):
         for row in ledger.journal(robot.home / 'spool', ROBOT):
             if row.sink == BAGS and row.robot == f'{ROBOT} {RECORDS}' and row.count and row.from_ns is not None:
                 in_bags[row.topic].append(Loss(row.from_ns, row.to_ns or 0, row.count, row.cause))
     lost = {
-        'objects': absent(of_objects(found, store, objects), happened.published),
-        'bags': absent(of_bags(found, own, NODE), happened.published),
-        'beside': absent(of_bags(found, beside, RECORDER), happened.published),
+        'objects': absent(stamps_in_objects(found, store, objects), happened.published),
+        'bags': absent(stamps_in_bags(found, own, NODE), happened.published),
+        'beside': absent(stamps_in_bags(found, beside, RECORDER), happened.published),
     }
-    judge_losses(found, 'objects', lost['objects'], said['objects'], happened.deaths[NODE])
-    judge_losses(found, 'bags', lost['bags'], said['bags'], happened.deaths[NODE])
+    audit_losses(found, 'objects', lost['objects'], reported['objects'], happened.deaths[NODE])
+    audit_losses(found, 'bags', lost['bags'], reported['bags'], happened.deaths[NODE])
     damaged = [at_ns for _, at_ns in happened.damages]
-    judge_losses(found, 'beside', lost['beside'], in_bags, happened.deaths[RECORDER], damaged)
-    judge_watermarks(found, rows, {sink: lost[sink] for sink in ('objects', 'bags')})
+    audit_losses(found, 'beside', lost['beside'], in_bags, happened.deaths[RECORDER], damaged)
+    audit_watermarks(found, rows, {sink: lost[sink] for sink in ('objects', 'bags')})
     found.wrong['overwritten'] += happened.overwritten
     found.wrong['hung'] += happened.hung
     left = [path for name in ('spool/ready', 'spool/held', 'spool/quarantine', 'spool/foreign', 'spool/incoming', BAGS, RECORDS)
@@ -512,8 +520,8 @@ def audit(found: Found, happened: Happened, tower: Tower, wire: Wire, robot: Rob
     server = Server(tower, wire)
     of_missions = {key: info for key, info in objects.items() if not key.startswith(f'{ROBOT}/rosbags/')}
     for flight in robot.flights:
-        joined.judge(missions, server, flight, of_missions)
-    joined.judge_marks(missions, robot.flights, of_missions)
+        joined.audit(missions, server, flight, of_missions)
+    joined.audit_marks(missions, robot.flights, of_missions)
     found.looked.update({f'mission {name}': count for name, count in missions.looked.items()})
     for name, lines in missions.wrong.items():
         found.wrong[f'missions: {name}'] += lines
@@ -522,7 +530,7 @@ def audit(found: Found, happened: Happened, tower: Tower, wire: Wire, robot: Rob
 
 
 def campaign(folder: Path, rounds: int, seed: int) -> tuple[Found, Happened]:
-    """Run and judge."""
+    """Run and audit."""
     found, happened = Found(), Happened()
     with Tower(folder / 'tower', mlflow=True) as tower, Wire(tower.endpoint_url, happened.heard) as s3:
         environ = tower.environment() | {'AWS_ENDPOINT_URL': s3.url}
@@ -547,8 +555,8 @@ def campaign(folder: Path, rounds: int, seed: int) -> tuple[Found, Happened]:
                 _end(robot.node, signal.SIGINT)
             found.wrong['imbalances'] += _imbalances(robot.home)
             progress('everything is read back')
-            told = {'damages': happened.damages, 'deaths': happened.deaths, 'published': happened.published}
-            (folder / 'happened.json').write_text(json.dumps(told, indent=1), encoding='utf-8')
+            report = {'damages': happened.damages, 'deaths': happened.deaths, 'published': happened.published}
+            (folder / 'happened.json').write_text(json.dumps(report, indent=1), encoding='utf-8')
             audit(found, happened, tower, s3, robot, store, folder)
         finally:
             store.close()
@@ -577,9 +585,9 @@ def _imbalances(home: Path) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     options = parser('lost_index', __doc__ or '')
-    options.add_argument('--rounds', type=int, default=0, help=f'how many damages, {ROUNDS} unless told')
+    options.add_argument('--rounds', type=int, default=0, help=f'how many damages (default {ROUNDS})')
     given = options.parse_args(argv)
     rounds = given.rounds or (SHORT_ROUNDS if given.short else ROUNDS)
     progress(f'{rounds} damages, seed {given.seed}')

@@ -1,7 +1,7 @@
-"""Kills the mission agent with SIGKILL in the middle of its missions, again and again, with Tower up and down.
+"""Kills the mission agent repeatedly with SIGKILL during its missions, with Tower up and down.
 
-Half of the time the process that sends is killed with it. Afterwards each mission must be one run in a real MLflow server, ended
-as KILLED at its last record, with every point and frame that a call had returned for, each once; the same in the store.
+Half of the time the sending process is killed with it. Afterwards each mission must be one run in a real MLflow server, ended as
+KILLED at its last record, with every point and frame whose call had returned, each once; the same in the store.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
 
 KILLS: Final = 50
 SHORT_KILLS: Final = 5
 LIVE_S: Final = (0.05, 4.0)
 SENDER_TOO: Final = 0.5
-"""How often the replayer dies with its agent, as at a power cut."""
+"""How often the replayer is killed with its agent, as in a power cut."""
 DELIVER_S: Final = 600.0
 COMMAND: Final = 'torture'
 
 
 @dataclass(slots=True)
 class Agent:
-    """What one agent had been told was logged when it died."""
+    """What an agent's calls had returned for when it was killed."""
 
     mission_id: str
     acknowledged: int
@@ -51,7 +51,7 @@ class Agent:
 
 @dataclass(slots=True)
 class Found:
-    """What does not hold, by bar; and how much was looked at."""
+    """Violations, by bar; and how much was checked."""
 
     wrong: dict[str, list[str]] = field(default_factory=lambda: {'runs': [], 'points': [], 'artifacts': [], 'store': []})
     points: int = 0
@@ -59,7 +59,7 @@ class Found:
 
 
 class Killer:
-    """One agent after the other in one home. Life: New; run once."""
+    """One agent after the other in one home. Lifecycle: New; run once."""
 
     def __init__(self, folder: Path, wire: Wire, environ: dict[str, str], rng: random.Random) -> None:
         self._home, self._wire, self._rng = folder / 'home', wire, rng
@@ -87,10 +87,10 @@ class Killer:
         command = [sys.executable, '-m', 'missions.agent', str(self._home), COMMAND, str(self._csv)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, env=self._environ) as agent:
             assert agent.stdout is not None
-            said = agent.stdout.readline()
-            time.sleep(self._rng.uniform(*LIVE_S))  # the moment of death, not a wait for anything
+            reported = agent.stdout.readline()
+            time.sleep(self._rng.uniform(*LIVE_S))  # a random life span, not a wait for a condition
             agent.kill()
-            lines = (said + agent.stdout.read()).decode().splitlines()
+            lines = (reported + agent.stdout.read()).decode().splitlines()
         given = lines[0]
         acknowledged = int(lines[-1]) if len(lines) > 1 else -1
         return Agent(next(folder.mission_id for folder in missions(self._home) if given in _ids(folder)), acknowledged)
@@ -108,7 +108,7 @@ def _ids(folder: MissionFolder) -> tuple[str, str]:
 
 
 def audit(server: Server, home: Path, agents: Sequence[Agent], objects: Counter[str]) -> Found:
-    """Compare MLflow and the store with what the agents were told and what the journals say."""
+    """Compare MLflow and the store with the agents' returned calls and the journals."""
     found = Found()
     by_mission: dict[str, list[Any]] = {}
     for run in server.runs(COMMAND):
@@ -116,25 +116,25 @@ def audit(server: Server, home: Path, agents: Sequence[Agent], objects: Counter[
     for agent in agents:
         runs = by_mission.get(agent.mission_id, [])
         folder = MissionFolder(home / MISSIONS / agent.mission_id)
-        said = [line.record for line in read(folder.journal) if line.record]
-        if len(runs) != 1 or runs[0].info.status != 'KILLED' or runs[0].info.end_time != said[-1]['t'] // 1_000_000:
+        reported = [line.record for line in read(folder.journal) if line.record]
+        if len(runs) != 1 or runs[0].info.status != 'KILLED' or runs[0].info.end_time != reported[-1]['t'] // 1_000_000:
             found.wrong['runs'].append(f'{agent.mission_id}: {[(run.info.run_id, run.info.status) for run in runs]}')
             continue
-        _judge(found, server, agent, said, runs[0].info.run_id, objects)
+        _audit(found, server, agent, reported, runs[0].info.run_id, objects)
     return found
 
 
-def _judge(found: Found, server: Server, agent: Agent, said: list[Any], run_id: str, objects: Counter[str]) -> None:
+def _audit(found: Found, server: Server, agent: Agent, reported: list[Any], run_id: str, objects: Counter[str]) -> None:
     steps = [point.step for point in server.history(run_id, 'battery_pct')]
     found.points += len(steps)
     if steps != list(range(len(steps))) or len(steps) <= agent.acknowledged:
         found.wrong['points'].append(f'{agent.mission_id}: {len(steps)} points, {agent.acknowledged + 1} acknowledged')
-    frames = {record['id'] for record in said if record['k'] == 'frame'}
+    frames = {record['id'] for record in reported if record['k'] == 'frame'}
     found.frames += len(frames)
     wanted = {f'camera/frame_{number:06d}.jpg' for number in frames} | {'summary.json'}
-    wanted |= {'trajectories/trajectory.csv'} if any(record['k'] == 'trajectory' for record in said) else set()
+    wanted |= {'trajectories/trajectory.csv'} if any(record['k'] == 'trajectory' for record in reported) else set()
     there = server.artifacts(run_id)
-    pictures = {'battery.png'} if len(steps) > 1 else set()  # frames are not pictures here, and nobody walks
+    pictures = {'battery.png'} if len(steps) > 1 else set()  # frames are not images here, and the robot does not walk
     if wanted | pictures != there or not frames >= set(range(0, agent.acknowledged + 1, FRAME_EVERY)):
         found.wrong['artifacts'].append(f'{agent.mission_id}: {sorted((wanted | pictures) ^ there)[:5]}')
     prefix = f'thor/missions/{run_id}/'
@@ -145,7 +145,7 @@ def _judge(found: Found, server: Server, agent: Agent, said: list[Any], run_id: 
 
 
 def stored(tower: Tower) -> Counter[str]:
-    """All keys of the bucket; raises AssertionError for a frame whose content is another's."""
+    """All keys of the bucket; raises AssertionError for a frame with another frame's content."""
     store = S3Store(tower.store_settings(), UploadSettings())
     store.open()
     try:
@@ -159,7 +159,7 @@ def stored(tower: Tower) -> Counter[str]:
 
 
 def campaign(folder: Path, kills: int, seed: int) -> Found:
-    """Run and judge."""
+    """Run and audit."""
     with Tower(folder / 'tower', mlflow=True) as tower, Wire(tower.tracking_uri) as wire:
         environ = tower.environment() | {'MLFLOW_TRACKING_URI': wire.url, 'MLFLOW_HTTP_REQUEST_TIMEOUT': '3'}
         agents = Killer(folder, wire, environ, random.Random(seed)).run(kills)
@@ -177,8 +177,8 @@ def campaign(folder: Path, kills: int, seed: int) -> Found:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
-    given = asked_kills(parser('missions', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
+    """The campaign; 0 if all requirements were met."""
+    given = parse_kills(parser('missions', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop:
         found = campaign(shop.folder, given.kills, given.seed)
         what = {

@@ -1,9 +1,12 @@
 """Kills a robot that follows a registry, with ``kill -9``, at each step of a sync, an activation, a rollback and a report.
 
-MLflow's registry and SeaweedFS are real, with the rights of a robot; so are signatures, hashes and smoke runs. A step is a call
-that makes something durable, or a piece of a download that arrives; many kills come at any time instead. Some rounds fill the
-disk up at a step. After each, ``current`` must be a whole, verified version: the one that was active before, or the one that was
-to be. What was cut off is then done once more, and must end there.
+MLflow's registry and SeaweedFS are real, with the permissions of a robot; so are signatures, hashes and smoke runs. A step is a
+call
+that makes something durable, or a downloaded piece; many kills happen at random times instead. Some rounds fill the disk at a
+step.
+After each, ``current`` must be a complete, verified version: the one that was active before, or the new one. The interrupted
+action is
+then repeated, and must succeed.
 """
 
 from __future__ import annotations
@@ -33,13 +36,13 @@ from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import PolicyManifest
 from shadowhound_data_logger.policies.registry import CHAMPION, MlflowRegistry
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
+from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
 from torture._disks import MEBI, Disk, NotAllowed, small_disk
 
 KILLS: Final = 200
 SHORT_KILLS: Final = 20
 FULL: Final = 5
-"""For so many kills the disk is filled up once."""
+"""The disk is filled once per this many kills."""
 VERSIONS: Final = 6
 ROBOT: Final = 'thor'
 NAME: Final = 'go2_patrol'
@@ -47,15 +50,15 @@ BALLAST: Final = 1_000_000
 """Floats in each model: the download takes some of the time."""
 DISK_MB: Final = 48
 STEPS: Final = ('fsync', 'fdatasync', 'replace', 'symlink', 'chmod', 'rename', 'rmdir', 'unlink')
-"""Calls of ``os`` before which a process may die."""
+"""Calls of ``os`` before which a process may be killed."""
 SPARE_STEPS: Final = 5
-"""A sync may have so many fewer than the first one: pieces of a download come as they come."""
+"""A sync may have this many fewer steps than the first one: the number of downloaded pieces varies."""
 WAIT_S: Final = 300.0
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One thing that the robot does, from one active version to another."""
+    """One action of the robot, from one active version to another."""
 
     act: str
     """``sync``, ``use``, ``rollback`` or ``report``."""
@@ -64,7 +67,7 @@ class Round:
 
 
 class Robot:
-    """Two versions at most, so that each sync of a new one downloads; its Spark, and its Tower."""
+    """At most two versions, so that each sync of a new one downloads; its Spark, and its Tower."""
 
     def __init__(self, tower: Tower, folder: Path, home: Path) -> None:
         self._tower = tower
@@ -93,7 +96,7 @@ class Robot:
         return MlflowRegistry(MlflowRest(self._tower.tracking_uri, self._tower.tracking(user), Path('/nonexistent')))
 
     def prepare(self, act: str, chance: random.Random) -> Round:
-        """Something to do from here: nothing is pinned, no version is bad, and what a rollback leads to was active before."""
+        """A possible next action: nothing is pinned, no version is bad, and the target of a rollback was active before."""
         before, installed = str(self.folder.current()), self.folder.versions.ids()
         is_new = act == 'sync'
         others = set(self.manifests).difference(installed) if is_new else {*installed} - {before}
@@ -120,7 +123,7 @@ class Robot:
                 running.judge(self.folder, one.before, self.manifests[one.before], 1000, 0.0)
 
     def wrong(self, allowed: Sequence[str]) -> str:
-        """What is wrong with the active version; empty for nothing."""
+        """What is wrong with the active version; empty if nothing."""
         now = self.folder.current()
         if now is None or now not in allowed:
             return f'{now} is active, and none of {allowed}'
@@ -131,7 +134,7 @@ class Robot:
         return '' if now in self.folder.state.read().verified else f'{now} was never verified'
 
     def start(self, one: Round, at: int | None = None, then: Callable[[], object] = lambda: None) -> int:
-        """Do it in a process of its own, in which ``then`` happens at the step of this number."""
+        """Run it in a separate process, in which ``then`` is called at this step."""
         self._steps.unlink(missing_ok=True)
         return forked(partial(self._counted, one, at, then))
 
@@ -152,7 +155,7 @@ class Robot:
         self._steps.write_text(str(steps))
 
     def steps(self) -> int:
-        """Of the last process that came to its end."""
+        """Steps of the last process that completed."""
         return int(self._steps.read_text()) if self._steps.exists() else 0
 
 
@@ -165,7 +168,7 @@ def _after(step: Callable[[], None], act: Callable[..., Any]) -> Callable[..., A
 
 
 def forked(act: Callable[[], None]) -> int:
-    """The process id of a child that does it, in a group of its own; its exit code is 1 where it fails."""
+    """The process id of a child that does it, in a separate group; its exit code is 1 on failure."""
     pid = os.fork()
     if pid == 0:
         code = 1
@@ -178,7 +181,7 @@ def forked(act: Callable[[], None]) -> int:
 
 
 def ended(pid: int) -> int:
-    """Its status. Raises TimeoutError where it hangs, and kills it then."""
+    """Its status. Raises TimeoutError if it hangs, and kills it then."""
     until_s = time.monotonic() + WAIT_S
     while time.monotonic() < until_s:
         found, status = os.waitpid(pid, os.WNOHANG)
@@ -191,7 +194,7 @@ def ended(pid: int) -> int:
 
 
 def fill(path: Path) -> None:
-    """The file takes all that is left of its disk."""
+    """The file takes all free space of its disk."""
     with path.open('wb', buffering=0) as file:
         for size in (MEBI, 4096, 1):
             with suppress(OSError):
@@ -200,7 +203,7 @@ def fill(path: Path) -> None:
 
 
 class Campaign:
-    """Rounds, and what was found."""
+    """Rounds, and the problems found."""
 
     def __init__(self, robot: Robot, disk: Disk | None, chance: random.Random) -> None:
         self._robot = robot
@@ -213,21 +216,21 @@ class Campaign:
         self.found: list[str] = []
 
     def begin(self) -> None:
-        """Each act once, uncut: how many steps it has, and how long it takes."""
+        """Each action once without a kill: its number of steps, and its duration."""
         robot = self._robot
-        for name in robot.manifests:  # all of them, in order: a version that was verified may follow a later one
+        for name in robot.manifests:  # all of them, in order: a verified version may follow a later one
             robot._registry.set_alias(NAME, CHAMPION, robot.manifests[name].version)
             robot.do(Round('sync', '', name))
         for act in ('sync', 'use', 'rollback', 'report'):
             one, began = robot.prepare(act, self._chance), time.monotonic()
             status = ended(robot.start(one))
             self._longest_s[act] = time.monotonic() - began
-            self._judge(one, [one.after], f'an uncut {act} ended with {status}')
+            self._audit(one, [one.after], f'an uncut {act} ended with {status}')
             self.steps[act] = robot.steps()
             self.killed_at[act] = set()
 
     def kills(self, count: int) -> None:
-        """Each step once, as far as there are so many, and then any time."""
+        """Each step once, as far as they exist, and then random times."""
         deck = [(act, step) for act, steps in self.steps.items() for step in range(steps)]
         self._chance.shuffle(deck)
         at_steps = max(count // 2, min(len(deck), count * 3 // 4))
@@ -239,19 +242,19 @@ class Campaign:
                 time.sleep(self._longest_s[act] * self._chance.uniform(0.0, 1.1))
                 os.kill(pid, 9)
             is_killed = os.WIFSIGNALED(ended(pid))
-            if step is None:  # most of them are to hit
+            if step is None:  # most of them should hit
                 self._longest_s[act] *= 1.05 if is_killed else 0.85
             self.outcomes['killed' if is_killed else 'done'] += 1
             if is_killed:
                 self.outcomes['before' if self._robot.folder.current() == one.before else 'after'] += 1
                 self.killed_at[act] |= {step} if step is not None else set()
-            self._judge(one, [one.before, one.after] if is_killed else [one.after], f'{act}, killed at {step}')
+            self._audit(one, [one.before, one.after] if is_killed else [one.after], f'{act}, killed at {step}')
             self._again(one)
             if self.outcomes['killed'] % 20 == 0 and is_killed:
                 progress(f'{self.outcomes["killed"]} kills, {len(self.found)} findings')
 
     def fills(self, count: int) -> None:
-        """The disk is full from any step on, and then has room again."""
+        """The disk is full from a random step on, and then has space again."""
         disk = self._disk
         if disk is None:
             return
@@ -260,16 +263,16 @@ class Campaign:
             one = self._robot.prepare(act, self._chance)
             status = ended(self._robot.start(one, step, partial(fill, disk.path / 'ballast')))
             self.outcomes['full disk, failed' if status else 'full disk, done'] += 1
-            self._judge(one, [one.before, one.after] if status else [one.after], f'{act}, disk full at {step}')
+            self._audit(one, [one.before, one.after] if status else [one.after], f'{act}, disk full at {step}')
             (disk.path / 'ballast').unlink(missing_ok=True)
             self._again(one)
 
     def _again(self, one: Round) -> None:
-        """What was cut off arrives when it is done once more."""
+        """The interrupted action must succeed when repeated."""
         self._robot.do(one)
-        self._judge(one, [one.after], f'{one.act}, once more')
+        self._audit(one, [one.after], f'{one.act}, once more')
 
-    def _judge(self, one: Round, allowed: Sequence[str], what: str) -> None:
+    def _audit(self, one: Round, allowed: Sequence[str], what: str) -> None:
         if wrong := self._robot.wrong(allowed):
             self.found.append(f'{what}, from {one.before} to {one.after}: {wrong}')
             progress(self.found[-1])
@@ -282,7 +285,7 @@ class Campaign:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The campaign."""
-    given = asked_kills(parser('policies', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
+    given = parse_kills(parser('policies', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop, ExitStack() as stack:
         (shop.folder / 'tmp').mkdir(exist_ok=True)
         os.environ['TMPDIR'] = str(shop.folder / 'tmp')  # of smoke runs that are killed

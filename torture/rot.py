@@ -1,4 +1,4 @@
-"""Damages whole spools by chance, for minutes: a start never fails, never ships a damaged object, loses no whole file."""
+"""Damages complete spools at random, for minutes: startup never fails, uploads a damaged object or loses an intact file."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def campaign(folder: Path, seed: int, seconds: float) -> tuple[int, Counter[str]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     options = parser('rot', __doc__ or '')
-    options.add_argument('--minutes', type=float, default=0.0, help=f'how long, {MINUTES:g} unless told')
+    options.add_argument('--minutes', type=float, default=0.0, help=f'how long, {MINUTES:g} by default')
     given = options.parse_args(argv)
     logging.disable(logging.CRITICAL)
     minutes = given.minutes or (SHORT_MINUTES if given.short else MINUTES)

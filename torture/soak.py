@@ -1,7 +1,8 @@
-"""A node for a long time, as a robot has it: outages, kills of Tower and steps of the clock, with bags and the ring of events on.
+"""Runs a node for a long time as on a robot: outages, kills of Tower and clock steps, with bags and the event ring enabled.
 
-The simulated Go2 walks all the time. Every few seconds it is noted what the node has in memory, descriptors, threads, index and
-shared memory: none of them may grow. Afterwards every message must be accounted for, and every object be in the store.
+The simulated Go2 walks all the time. Memory, descriptors, threads, index and shared memory of the node are sampled every few
+seconds:
+none of them may grow. Afterwards every message must be accounted for, and every object must be in the store.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ CALM_S: Final = (20.0, 180.0)
 FAULT_S: Final = (5.0, 120.0)
 DELIVER_S: Final = 1800.0
 STEPS_S: Final = (-300, 300)
-"""How far the clock is wrong: not so far that the store refuses the signatures."""
+"""The clock's error: not so large that the store rejects signatures."""
 FLAT_MB: Final = 16.0
 LOG_MB, INDEX_BYTES = 6.0, 2_000
-"""Of the index: its write-ahead log, and what it remembers of an object for three days."""
+"""Growth of the index: its write-ahead log, and three days of remembered objects."""
 FLAT_COUNT: Final = 4
 """Descriptors and threads that come and go."""
 BAD_ANSWER: Final = (503, 'SlowDown')
@@ -59,12 +60,12 @@ COLORS: Final = {REFUSE: AMBER, HANG: AMBER, BAD_ANSWER[1]: AMBER, TOWER: '#b23a
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What the node had at one moment."""
+class Sample:
+    """The node's resources at one moment."""
 
     s: float
     own_mb: float
-    """Memory of its own: without libraries and the middleware's shared memory."""
+    """Private memory: without libraries and the middleware's shared memory."""
     descriptors: int
     threads: int
     index_mb: float
@@ -77,7 +78,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What was wrong, and from when to when."""
+    """A fault, with start and end."""
 
     what: str
     begin_s: float
@@ -88,7 +89,7 @@ class Fault:
 class Soak:
     """What happened. Times are seconds since the start."""
 
-    looks: list[Look] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
     published: dict[str, int] = field(default_factory=dict)
     ledger: dict[str, Any] = field(default_factory=dict)
@@ -97,13 +98,13 @@ class Soak:
 
     def bars(self) -> Iterator[Bar]:
         rows = self.ledger['topics']
-        told = {topic: rows[topic]['received'] + rows[topic]['missed'] if topic in rows else 0 for topic in self.published}
+        report = {topic: rows[topic]['received'] + rows[topic]['missed'] if topic in rows else 0 for topic in self.published}
         open_ends = [
-            f'{topic}: {count} published, {told[topic]} received or missed'
+            f'{topic}: {count} published, {report[topic]} received or missed'
             for topic, count in self.published.items()
-            if not is_accounted(told[topic], count)
+            if not is_accounted(report[topic], count)
         ]
-        yield Bar('every message is received or listed as missed', bool(told) and not open_ends, '; '.join(open_ends))
+        yield Bar('every message is received or listed as missed', bool(report) and not open_ends, '; '.join(open_ends))
         dropped = {topic: row['dropped'] for topic, row in rows.items() if row['dropped']}
         yield Bar('none that was received is dropped', not dropped, str(dropped or ''))
         yield Bar('the ledger balances, at any time', not self.unbalanced, '; '.join(self.unbalanced[:3]))
@@ -114,31 +115,31 @@ class Soak:
             yield Bar(f'{what} do not grow' if what.endswith('s') else f'{what} does not grow', late - early <= most,
                       f'{early:.1f} in the second quarter, {late:.1f} in the last')  # fmt: skip
 
-        early, late = self.looks[len(self.looks) // 4], self.looks[-1]
+        early, late = self.samples[len(self.samples) // 4], self.samples[-1]
         grown, objects = late.index_mb - early.index_mb, late.delivered - early.delivered
         yield Bar('the index grows with what it remembers alone', grown <= LOG_MB + objects * INDEX_BYTES / 1e6,
                   f'{grown:.1f} MB for {objects} objects')  # fmt: skip
 
     def early_and_late(self, what: str) -> tuple[float, float]:
         """Medians of the second and of the last quarter of the time in which the robot published."""
-        values = [float(getattr(poll, what)) for poll in self.looks]
+        values = [float(getattr(poll, what)) for poll in self.samples]
         quarter = max(1, len(values) // 4)
         return statistics.median(values[quarter : 2 * quarter] or values), statistics.median(values[-quarter:])
 
     def figures(self) -> dict[str, Any]:
-        last = self.looks[-1]
+        last = self.samples[-1]
         return {
             'minutes': round(last.s / 60, 1), 'faults': dict(Counter(fault.what for fault in self.faults)),
             'messages': sum(self.published.values()), 'missed': sum(row['missed'] or 0 for row in self.ledger['topics'].values()),
             'objects': self.ledger['objects']['delivered'],
-            'most_pending': max(poll.pending for poll in self.looks), 'index_mb': last.index_mb,
+            'most_pending': max(poll.pending for poll in self.samples), 'index_mb': last.index_mb,
             **{what: [round(value, 1) for value in self.early_and_late(what)]
                for what in ('own_mb', 'descriptors', 'threads', 'shm_mb')},
         }  # fmt: skip
 
 
 class Robot:
-    """A simulated Go2, its node and its Tower, to which things happen. Life: New; run once."""
+    """A simulated Go2, its node and its Tower, which are disturbed. Lifecycle: New; run once."""
 
     def __init__(self, tower: Tower, wire: Wire, processes: Processes, rng: random.Random, scale: float) -> None:
         self._tower, self._wire, self._rng = tower, wire, rng
@@ -185,29 +186,29 @@ class Robot:
         else:
             self._wire.set(PASS)
         self.soak.faults.append(Fault(what, begin_s, self._now()))
-        progress(f'{self._now() / 60:.1f} min: {what} for {self._now() - begin_s:.0f} s, {self.soak.looks[-1]}')
+        progress(f'{self._now() / 60:.1f} min: {what} for {self._now() - begin_s:.0f} s, {self.soak.samples[-1]}')
 
     def _watch(self, seconds: float) -> None:
-        """Look at the node until then; now and then something happens of which a bag is made."""
+        """Sample the node until then; now and then trigger an event."""
         end_s = self._now() + seconds
         while self._now() < end_s:
-            said = ledger.read(self.node.home / 'spool', ROBOT)
-            self.soak.unbalanced += ledger.imbalances(said)
-            self.soak.looks.append(_look(self.node, said, self._now()))
+            reported = ledger.read(self.node.home / 'spool', ROBOT)
+            self.soak.unbalanced += ledger.imbalances(reported)
+            self.soak.samples.append(_sample(self.node, reported, self._now()))
             if self._rng.random() < LOOK_S / 120.0:
                 connection = Connection(self.node.home / 'spool', NAME)
                 connection.ask('event', name='soak')
                 connection.close()
-            time.sleep(max(0.0, min(LOOK_S, end_s - self._now())))  # the rhythm of the figures
+            time.sleep(max(0.0, min(LOOK_S, end_s - self._now())))  # the sampling interval
 
 
-def _look(node: Node, said: Mapping[str, Any], now_s: float) -> Look:
+def _sample(node: Node, reported: Mapping[str, Any], now_s: float) -> Sample:
     proc, index = Path('/proc', str(node.popen.pid)), node.home / 'spool' / 'index.db'
     mapped = {line.rpartition(' ')[2] for line in (proc / 'maps').read_text().splitlines() if f' {FOLDER}/' in line}
     sizes = [_size(Path(path)) for path in mapped]
     threads = next(line for line in (proc / 'status').read_text().splitlines() if line.startswith('Threads:'))
-    objects = said['objects']
-    return Look(
+    objects = reported['objects']
+    return Sample(
         round(now_s, 1), round(memory(node.popen.pid).anon, 1), len(list((proc / 'fd').iterdir())), int(threads.split()[1]),
         round((_size(index) + _size(index.with_name('index.db-wal'))) / 1e6, 2), round(sum(sizes) / 1e6, 1), objects['pending'],
         objects['delivered'],
@@ -222,7 +223,7 @@ def _size(path: Path) -> int:
 
 
 def _kill(tower: Tower) -> None:
-    """The server itself with SIGKILL; what guards it ends with it."""
+    """Kill the server with SIGKILL; its guard exits with it."""
     guard = tower._s3 and tower._s3._guard
     assert guard
     for child in Path(f'/proc/{guard.pid}/task/{guard.pid}/children').read_text().split():
@@ -232,9 +233,9 @@ def _kill(tower: Tower) -> None:
     tower.stop_s3()
 
 
-def draw(looks: Sequence[Mapping[str, Any]], faults: Sequence[Mapping[str, Any]], target: Path) -> None:
-    """What the node had over the minutes, and when what was wrong."""
-    minutes = [poll['s'] / 60 for poll in looks]
+def draw(samples: Sequence[Mapping[str, Any]], faults: Sequence[Mapping[str, Any]], target: Path) -> None:
+    """Plot the node's resources over the minutes, and the faults."""
+    minutes = [poll['s'] / 60 for poll in samples]
     lines = {'own_mb': 'memory [MB]', 'descriptors': 'descriptors', 'threads': 'threads', 'shm_mb': 'shared [MB]',
              'index_mb': 'index [MB]', 'pending': 'objects that wait'}  # fmt: skip
     with mpl.rc_context(STYLE):
@@ -242,7 +243,7 @@ def draw(looks: Sequence[Mapping[str, Any]], faults: Sequence[Mapping[str, Any]]
         for axes, (what, label) in zip(figure.subplots(len(lines), 1, sharex=True), lines.items(), strict=True):
             for fault in faults:
                 axes.axvspan(fault['begin_s'] / 60, fault['end_s'] / 60, color=COLORS[fault['what']], alpha=0.25, lw=0)
-            axes.plot(minutes, [poll[what] for poll in looks], color=BLUE if what != 'pending' else INK, lw=1.2)
+            axes.plot(minutes, [poll[what] for poll in samples], color=BLUE if what != 'pending' else INK, lw=1.2)
             axes.set(ylabel=label, ylim=(0, None))
             axes.yaxis.label.set_size(8)
         axes.set(xlabel='minutes (yellow: the store is away, red: Tower is killed, green: the clock is wrong)', xlim=(0, None))
@@ -250,7 +251,7 @@ def draw(looks: Sequence[Mapping[str, Any]], faults: Sequence[Mapping[str, Any]]
 
 
 def campaign(folder: Path, seconds: float, seed: int, scale: float = 1.0) -> Soak:
-    """Run and judge; ``folder`` needs some 250 MB a minute at the robot's own rates."""
+    """Run and audit; ``folder`` needs some 250 MB per minute at the robot's own rates."""
     with Tower(folder / 'tower') as tower:
         with Wire(tower.endpoint_url) as wire, running(folder) as processes:
             robot = Robot(tower, wire, processes, random.Random(seed), scale)
@@ -264,9 +265,9 @@ def campaign(folder: Path, seconds: float, seed: int, scale: float = 1.0) -> Soa
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The campaign; 0 when everything held."""
+    """The campaign; 0 if all requirements were met."""
     options = parser('soak', __doc__ or '')
-    options.add_argument('--minutes', type=float, default=0.0, help=f'how long, {MINUTES:g} unless told; 480 is a night')
+    options.add_argument('--minutes', type=float, default=0.0, help=f'how long, {MINUTES:g} by default; 480 is a night')
     options.add_argument('--scale', type=float, default=1.0, help="of the robot's rates: a night at 1 needs 120 GB (default 1)")
     options.add_argument('--picture', type=Path, metavar='FILE.png', help='draw what the node had over the time')
     given = options.parse_args(argv)

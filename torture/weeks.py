@@ -1,9 +1,11 @@
-"""Simulated weeks of a robot that keeps what it records: shifts, a dock, two WiFi networks, a disk that others fill, requests.
+"""Simulated weeks of a robot that keeps its recordings: shifts, a dock, two WiFi networks, a disk that others fill, requests.
 
-Time is virtual; spool, rules, thinning, requests, catalog and the store, a folder, are the real ones. Each minute of a shift
-the robot records an archive of pictures, each ten minutes a slice of a bag, now and then an event. At every hour the ledger is
-held to the gap journal, at the end of a day to the files, the catalog and the store: nothing is thinned, evicted, sent or
-deleted that no rule names, and of the last day at least a picture a second is left. At the end ``lake prune`` keeps half.
+Time is virtual; spool, rules, thinning, requests, catalog and the store, a folder, are real. Each minute of a shift the robot
+records
+an archive of images, every ten minutes a slice of a bag, now and then an event. Every hour the ledger is compared with the gap
+journal, at the end of a day with the files, the catalog and the store: nothing is thinned, evicted, sent or deleted unless a rule
+says
+so, and of the last day at least one image per second is left. At the end ``lake prune`` keeps half.
 """
 
 from __future__ import annotations
@@ -67,9 +69,9 @@ MONDAY_NS: Final = 1_759_708_800 * SECOND
 MINUTE_NS, HOUR_NS, DAY_NS = 60 * SECOND, 3600 * SECOND, 24 * 3600 * SECOND
 ROBOT: Final = 'thor'
 FRAMES: Final = 120
-"""Pictures a minute: two a second."""
+"""Images per minute: two per second."""
 LEAST: Final = 60
-"""Of a minute of the last day."""
+"""Images left of a minute of the last day."""
 PICTURE: Final = 96
 KEEP: Final = KeepSettings(max_bytes=80_000_000, days=6.0, thin_to_hz=1.0, poll_s=10.0)
 DISK: Final = 160_000_000
@@ -78,26 +80,26 @@ FREE: Final = 20_000_000
 RULE: Final = 'wifi.ssid == "lab" and lowstate:bms_state.soc > 30'
 EVENTS_RULE: Final = 'not wifi.ssid == "guest"'
 RATE: Final = 40
-"""Objects that the link takes in a minute."""
+"""Objects that the link carries per minute."""
 SHIP: Final = {meta.ROBOT: ROBOT, meta.SHIP: meta.ON_REQUEST}
 CAMERA = Channel('/front', COMPRESSED_IMAGE, '', '', '', '')
 IMU = Channel('/imu', 'sensor_msgs/msg/Imu', '', '', '', '')
 
 
 class World:
-    """Where the robot is and what it hears: the facts of its rules, minute by minute."""
+    """Where the robot is and which networks it sees: the facts of its rules, minute by minute."""
 
     def __init__(self, chance: random.Random, clock: FakeClock) -> None:
         self._chance, self._clock = chance, clock
         self.soc = 90.0
         self.ssid = 'lab'
         self.others = 0
-        """Bytes of the disk that other programs take."""
+        """Bytes of the disk that other programs use."""
         self.shift = range(0)
         self.day = -1
 
     def passes(self) -> None:
-        """A minute."""
+        """One minute passes."""
         day, minute = divmod((self._clock.now_ns - MONDAY_NS) // MINUTE_NS, 24 * 60)
         if day != self.day:
             self.day = day
@@ -132,7 +134,7 @@ class World:
 
 
 class Weeks:
-    """A robot, its store, and the books that are kept of both. New; ``run`` once."""
+    """A robot, its store, and the expected state of both. New; ``run`` once."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self.folder = folder
@@ -147,15 +149,15 @@ class Weeks:
         self.figures: Counter[str] = Counter()
         self.faults: list[str] = []
         self.recorded: dict[str, tuple[int, int]] = {}
-        """Key of an archive -> when it began, and its pictures."""
+        """Key of an archive -> its start, and its images."""
         self.asked: dict[str, dict[str, int]] = {}
-        """Request -> the archives that it is to bring, with their pictures then."""
+        """Request -> the archives that it must deliver, with their images at that time."""
         self.sent: dict[str, int] = {}
-        """Key of an archive in the store -> its pictures."""
+        """Key of an archive in the store -> its images."""
         self._open()
 
     def run(self, days: int) -> None:
-        """So many days, then the pruning."""
+        """This many days, then the pruning."""
         self._write_inbox([])
         with mock.patch.object(Tree, 'free_bytes', side_effect=self._free):
             for minute in range(days * 24 * 60):
@@ -166,7 +168,7 @@ class Weeks:
                     is_last = minute % (24 * 60) == 24 * 60 - 1
                     self._audit(whole=is_last)
                     if is_last:
-                        _tell_day(minute // (24 * 60) + 1, days, self.figures)
+                        _print_day(minute // (24 * 60) + 1, days, self.figures)
             self.world.ssid, self.world.soc = 'lab', 100.0
             self.spool.close()
         self._prune(days)
@@ -188,7 +190,7 @@ class Weeks:
         self.closed = {name: found.why for name, found in judged.items() if not found.holds}
         for _ in range(6):
             self.server.step()
-        self._tell()
+        self._write_catalog()
         if self.world.ssid:
             self._send()
 
@@ -237,7 +239,7 @@ class Weeks:
                     t_end_ns=now_ns + 1, protected=True, metadata={meta.ROBOT: ROBOT, meta.EVENT: 'bump'})  # fmt: skip
 
     def _ask(self) -> None:
-        """Somebody wants up to an hour of the camera, of the last three days."""
+        """Request up to an hour of the camera, of the last three days."""
         since_ns = self.clock.now_ns - self.chance.randrange(3 * DAY_NS)
         want = KeptFilter(sensor='camera', since_ns=since_ns, until_ns=since_ns + self.chance.randrange(HOUR_NS))
         asked = PullRequest(robot=ROBOT, by=self.chance.choice(('ada', 'bob')), made_ns=self.clock.now_ns,
@@ -245,7 +247,7 @@ class Weeks:
         self._write_inbox([*self.entries[-50:], asked.to_json()])
         self.server.step()
         for _ in range(20):
-            self.server._poll_at_s = 0.0  # it looks at once
+            self.server._poll_at_s = 0.0  # it polls immediately
             self.server.step()
             if any(row.id == asked.id for row in self.spool.requests.rows()):
                 break
@@ -257,7 +259,7 @@ class Weeks:
         self.figures['objects asked for'] += len(self.asked[asked.id])
 
     def _send(self) -> None:
-        """What the link takes in a minute; nothing that waits for a rule which does not hold."""
+        """Send what the link carries in a minute; objects that wait for a false rule must not be sent."""
         items = self.spool.pending(RATE, waiting_for=self.closed)
         for item in items:
             rule = waits_for(_sensor(item), item.metadata, protected=self._is_protected(item))
@@ -269,7 +271,7 @@ class Weeks:
         self.spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
         self.figures['objects sent'] += len(items)
 
-    def _tell(self) -> None:
+    def _write_catalog(self) -> None:
         self.now_s = (self.clock.now_ns - MONDAY_NS) / SECOND
         self.spool.commit(self.catalog.due())
 
@@ -295,16 +297,16 @@ class Weeks:
         self.spool.commit([item])
 
     def _free(self) -> int:
-        """Of a disk with other programs on it."""
+        """Free space on a disk with other programs."""
         if not hasattr(self, 'spool'):
             return DISK
         kept = sum(size for (size,) in self._query("SELECT bytes FROM tally WHERE topic <> '' AND state IN ('kept', 'pending')"))
         return DISK - self.world.others - kept
 
-    # -- the books --------------------------------------------------------------------------------------------------------
+    # -- audits -----------------------------------------------------------------------------------------------------------
 
     def _audit(self, *, whole: bool) -> None:
-        """At the end of an hour; ``whole`` at that of a day, when files are read and the store is asked as well."""
+        """At the end of an hour; ``whole`` at the end of a day, when files are read and the store is checked as well."""
         now = iso(self.clock.now_ns)
         self.figures['hours'] += 1
         if whole:
@@ -318,18 +320,18 @@ class Weeks:
         self._check_last_day(now, found)
         self._check_requests(now)
         self._check_gaps(now)
-        if whole and not self.closed and self._until_told():
+        if whole and not self.closed and self._is_catalog_current():
             self._check_store(now)
 
     def _check_last_day(self, now: str, found: Sequence[dict[str, Any]]) -> None:
-        """A picture a second of each minute that was recorded, on the robot or in the store."""
+        """One image per second of each recorded minute, on the robot or in the store."""
         there = {row['key']: row['samples'] for row in found if row['state'] in {'kept', 'pending', 'delivered'}} | self.sent
         for key, (begin_ns, _) in self.recorded.items():
             if begin_ns >= self.clock.now_ns - DAY_NS and there.get(key, 0) < LEAST:
                 self.faults.append(f'{now}: of {iso(begin_ns)} {there.get(key, 0)} pictures are left')
 
     def _check_requests(self, now: str) -> None:
-        """What was asked for arrives as it was when it was asked for."""
+        """Requested objects arrive with their content at the time of the request."""
         for request, wanted in list(self.asked.items()):
             late = [key for key, count in wanted.items() if key in self.sent and self.sent[key] != count]
             if late:
@@ -339,14 +341,14 @@ class Weeks:
                 del self.asked[request]
 
     def _check_gaps(self, now: str) -> None:
-        """The gap journal has each message that the ledger calls evicted."""
-        said = dict(self._query("SELECT topic, sum(count) FROM gaps WHERE kind = 'evicted' GROUP BY topic"))
+        """The gap journal has each message that the ledger counts as evicted."""
+        reported = dict(self._query("SELECT topic, sum(count) FROM gaps WHERE kind = 'evicted' GROUP BY topic"))
         tally = dict(self._query("SELECT topic, samples FROM tally WHERE state = 'evicted' AND topic <> '' AND samples > 0"))
-        if {topic: count for topic, count in said.items() if count} != tally:
-            self.faults.append(f'{now}: the gap journal says {said}, the ledger {tally}')
+        if {topic: count for topic, count in reported.items() if count} != tally:
+            self.faults.append(f'{now}: the gap journal says {reported}, the ledger {tally}')
 
-    def _until_told(self) -> bool:
-        """Whether the catalog has all by now."""
+    def _is_catalog_current(self) -> bool:
+        """Whether the catalog is up to date."""
         for _ in range(40):
             self.now_s += 60.0
             self.spool.commit(self.catalog.due())
@@ -358,7 +360,7 @@ class Weeks:
         return False
 
     def _check_store(self, now: str) -> None:
-        """What the store says that the robot keeps, and what it has, is so."""
+        """The store's list of kept and stored objects is correct."""
         self.figures['days held against the store'] += 1
         findings = Findings(lambda _: None)
         kept = {
@@ -373,20 +375,22 @@ class Weeks:
             if kept[key][0] != own[key][0] or (own[key][1] is not None and kept[key][1] != int(own[key][1])):
                 self.faults.append(f'{now}: {key} has {own[key]}, the catalog says {kept[key]}')
         for topic, sink in (('/camera', 'objects'), ('/front', 'bags')):
-            told = gaps.newest(self.source, robot=ROBOT, topic=topic, sink=sink, findings=findings).to_pylist()
-            said = sum(row['count'] or 0 for row in told if row['kind'] == 'evicted')
+            report = gaps.newest(self.source, robot=ROBOT, topic=topic, sink=sink, findings=findings).to_pylist()
+            reported = sum(row['count'] or 0 for row in report if row['kind'] == 'evicted')
             account = topic if sink == 'objects' else f'bag:{topic}'
             count = next(
                 (count for (count,) in self._query("SELECT samples FROM tally WHERE state = 'evicted' AND topic = ?", account)), 0
             )
-            if said != count:
-                self.faults.append(f'{now}: the journal in the store has {said} evicted messages of {topic}, the ledger {count}')
+            if reported != count:
+                self.faults.append(
+                    f'{now}: the journal in the store has {reported} evicted messages of {topic}, the ledger {count}'
+                )
         for key in self.sent:
             if self.store.head(BUCKET, key) is None:
                 self.faults.append(f'{now}: {key} is not in the store')
 
     def _prune(self, days: int) -> None:
-        """Half of the time is kept of the camera; each deletion has its row."""
+        """Keep half of the time of the camera; each deletion has its row."""
         now_ns = MONDAY_NS + days * DAY_NS
         findings = Findings(lambda _: None)
         since = max(1, days // 2)
@@ -396,16 +400,16 @@ class Weeks:
         with mock.patch.object(time, 'time_ns', return_value=now_ns):
             prune.apply(self.source, self.store, made, now_ns=now_ns, findings=findings)
         after = self._stored()
-        said = {row['key'] for row in forgotten(self.source, ROBOT, findings).to_pylist()} if before != after else set()
+        reported = {row['key'] for row in forgotten(self.source, ROBOT, findings).to_pylist()} if before != after else set()
         old = {key for key in before if self._ended(key) < now_ns - since * DAY_NS}
         self.figures['objects pruned'] = len(before - after)
         if before - after != old:
             self.faults.append(f'pruned: {len(before - after)} objects, where the rule names {len(old)}')
-        if not (before - after) <= said:
-            self.faults.append(f'{len((before - after) - said)} deleted objects have no row that says so')
+        if not (before - after) <= reported:
+            self.faults.append(f'{len((before - after) - reported)} deleted objects have no row that says so')
 
     def _ended(self, key: str) -> int:
-        """When the last message of an object of the camera was; of an event its only one."""
+        """Time of the last message of a camera object; for an event its only one."""
         begin_ns, _ = self.recorded.get(key, (0, 0))
         return begin_ns + (FRAMES - 1) * MINUTE_NS // FRAMES if begin_ns else int(Path(key).stem.rpartition('_')[2])
 
@@ -439,9 +443,9 @@ class Weeks:
             return [dict(row) for row in db.execute(f'SELECT * FROM objects WHERE {where}', values)]  # noqa: S608 - own constants only
 
 
-def _tell_day(day: int, days: int, figures: Counter[str]) -> None:
-    said = ('objects recorded', 'messages thinned', 'messages evicted', 'objects sent', 'requests', 'requests served')
-    progress(f'day {day} of {days}: ' + ', '.join(f'{figures[name]:,} {name}' for name in said))
+def _print_day(day: int, days: int, figures: Counter[str]) -> None:
+    reported = ('objects recorded', 'messages thinned', 'messages evicted', 'objects sent', 'requests', 'requests served')
+    progress(f'day {day} of {days}: ' + ', '.join(f'{figures[name]:,} {name}' for name in reported))
 
 
 def _day(time_ns: int) -> str:
@@ -453,9 +457,9 @@ def _sensor(item: SpooledObject) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 1 when something was thinned, evicted, sent or deleted that no rule names, or the books do not agree."""
+    """Exit code 1 if something was thinned, evicted, sent or deleted without a rule, or the records do not agree."""
     options = parser('weeks', 'Simulated weeks of a robot that keeps what it records.')
-    options.add_argument('--weeks', type=float, help=f'how many, {WEEKS} unless told; in short {SHORT_DAYS} days')
+    options.add_argument('--weeks', type=float, help=f'how many (default {WEEKS}); in short {SHORT_DAYS} days')
     given = options.parse_args(arguments)
     days = SHORT_DAYS if given.short and given.weeks is None else math.ceil(7 * (given.weeks or WEEKS))
     progress(f'{days} days, seed {given.seed}')

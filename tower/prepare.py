@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Prepares a Tower's S3 server: its buckets, and permissions by which a robot can neither delete nor replace stored objects.
+"""Prepares a Tower's S3 server: its buckets, and permissions that keep a robot from deleting or replacing stored objects.
 
 It needs only boto3, takes AWS_ENDPOINT_URL and the keys of the user ``tower`` from the environment, and can be run again at any
 time. Replacing: SeaweedFS has no policy condition for a PUT without If-None-Match, so versions are kept: the first one stays

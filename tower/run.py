@@ -40,7 +40,7 @@ from shadowhound_data_logger.doctor import seaweedfs
 HERE: Final = Path(__file__).resolve().parent
 POSTGRES_PORT, MASTER_PORT = 5432, 9333
 LOOPBACK: Final = '127.0.0.1'
-EVERY_ADDRESS: Final = ('0.0.0.0', '::')  # noqa: S104 - as it may be asked for
+EVERY_ADDRESS: Final = ('0.0.0.0', '::')  # noqa: S104 - if it is requested
 READY_S: Final = 120.0
 LOOK_S: Final = 1.0
 POSTGRES_USER, MLFLOW_USER = 'postgres', 'shadowhound-mlflow'

@@ -1,6 +1,6 @@
 """``sensor_logger_node``: stores what the robot publishes, and accounts for every message in the ledger.
 
-   ros2 run shadowhound_data_logger sensor_logger_node --ros-args --params-file go2.yaml -r __ns:=/tachi
+    ros2 run shadowhound_data_logger sensor_logger_node --ros-args --params-file go2.yaml -r __ns:=/tachi
 
 Exit codes: 0 stopped on request, 1 a failure, 2 invalid settings.
 """

@@ -13,7 +13,7 @@ killed between waiting and processing (pull request 4737).
 A process that is killed while it creates a port leaves an unfinished one, and every process that opens it waits forever
 (managed_open_or_create_impl.hpp of boost interprocess). ``settle`` marks it as damaged, and the next process creates it again.
 
-   flock --no-fork FILE python -I -S port_guard.py PID
+    flock --no-fork FILE python -I -S port_guard.py PID
 
 As a program, which ``flock`` executes once its parent has released the lock, it settles what the parent left. It imports nothing
 from the package.

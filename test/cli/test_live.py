@@ -16,21 +16,21 @@ TILES = 'https://tile.example/{z}/{x}/{y}.png'
 @pytest.mark.parametrize('tiles', ['https://tile.example/', 'file:///{z}/{x}/{y}', "https://a b;'x/{z}/{x}/{y}", '{z}{x}{y}'])
 def test_tiles_are_a_url_with_places(tmp_path: Path, tiles: str) -> None:
     """Nothing else gets into the policy of the page."""
-    check_urls(tmp_path / 'none', None, None, TILES)
+    check_urls(tmp_path / 'none', None, None, TILES, None)
     with pytest.raises(BadUsage, match='--tiles'):
-        check_urls(tmp_path / 'none', None, None, tiles)
+        check_urls(tmp_path / 'none', None, None, tiles, None)
 
 
 def test_a_relayed_robot_is_on_another_machine(tmp_path: Path) -> None:
     """Not where a spool is; and it has no cameras to serve."""
-    check_urls(tmp_path / 'none', 'http://thor:8765/', None, '')
+    check_urls(tmp_path / 'none', 'http://thor:8765/', None, '', None)
     for folder, url, rtsp in (
         (tmp_path, 'http://thor:8765/', None),
         (tmp_path / 'none', 'http://thor:8765/', 8554),
         (tmp_path / 'none', 'thor', None),
     ):
         with pytest.raises(BadUsage):
-            check_urls(folder, url, rtsp, '')
+            check_urls(folder, url, rtsp, '', None)
 
 
 def test_whose_page_it_is_follows_from_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ def message(name: str, number: int, size: int) -> bytes:
     return b'\0\1\0\0' + struct.pack('<I', len(text)) + text
 
 
-def told(text: str) -> tuple[str, int]:
+def parse_numbered(text: str) -> tuple[str, int]:
     """Name and number of a String."""
     name, number, _ = text.split(':')
     return name, int(number)

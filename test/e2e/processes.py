@@ -65,7 +65,7 @@ class Process:
     def log(self) -> str:
         return self.log_path.read_text(encoding='utf-8', errors='replace')
 
-    def said(self, words: str, seconds: float = WAIT_S) -> None:
+    def await_log(self, words: str, seconds: float = WAIT_S) -> None:
         """Wait until the words are in the log."""
 
         def looked() -> bool:
@@ -261,7 +261,7 @@ class Processes:
         self.started.append(node)
         node.home, node.robot = self.folder / home, robot
         if ready:
-            node.said('logging ')
+            node.await_log('logging ')
         return node
 
     def sim(self, *parameters: str, namespace: str = '/') -> Process:
@@ -277,7 +277,7 @@ class Processes:
         environ = {**self.environ, 'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
         command = [*program, 'live', '--json', '--port', str(port), *arguments]
         page = self._keep(Process(name, command, self.folder / f'{name}.log', environ))
-        page.said('"problem"')
+        page.await_log('"problem"')
         said = page.log
         return page, json.loads(said[said.index('{') : said.rindex('}') + 1])['url']
 
@@ -287,7 +287,7 @@ class Processes:
         name = self._name('witness')
         command = [str(HERE / 'witness.py'), str(output), order]
         witness = self._keep(Process(name, command, self.folder / f'{name}.log', self.environ, forked=self._forked))
-        witness.said('ready')
+        witness.await_log('ready')
         return witness
 
     def publisher(self, *, cyclone: bool = False, environ: Mapping[str, str] | None = None) -> Publisher:

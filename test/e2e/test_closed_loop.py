@@ -171,7 +171,7 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
     of_driver = {**processes.environ, **thor, 'PYTHONPATH': path}
     driver = Process('driver', [str(ROOT / 'examples/policy_node.py')], tmp_path / 'driver.log', of_driver)
     processes.started.append(driver)
-    driver.said(f'{made} drives')
+    driver.await_log(f'{made} drives')
     before = heard[-1].pose.pose.position
 
     def gone() -> bool:

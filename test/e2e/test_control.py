@@ -133,7 +133,7 @@ def test_another_rate_is_in_force_at_once(operated: Operated) -> None:
     operated.publish('sampled', range(COUNT))
     assert operated.node.topic('/sampled')['skipped'] == COUNT - 1
     assert operated.station.set(sampled__rate_hz=0) == ''
-    operated.node.said('sampled.rate_hz = 0.0 from now on')
+    operated.node.await_log('sampled.rate_hz = 0.0 from now on')
     operated.station.flush()  # the intake has done what was asked of it before
     operated.publish('sampled', range(COUNT, 2 * COUNT))
     operated.station.flush()

@@ -88,7 +88,7 @@ def test_a_store_that_fails_and_recovers(
     wire.set(mode)
     try:
         wired.publish()
-        wired.node.said(words)
+        wired.node.await_log(words)
         row = wired.node.topic(TOPIC)
         assert row['stored_in']['pending'] >= 1
         assert row['stored_in']['quarantined'] == 0
@@ -106,7 +106,7 @@ def test_a_server_that_is_not_there_yet(processes: Processes, tmp_path: Path) ->
         late.stop_s3()
         talking = talk(processes, late.environment())
         talking.publish()
-        talking.node.said('refused the connection')
+        talking.node.await_log('refused the connection')
         assert talking.node.topic(TOPIC)['stored_in']['pending'] == COUNT
         late.start_s3()
         store.open()
@@ -118,7 +118,7 @@ def test_a_wrong_secret(processes: Processes, seaweed: Tower, stored: Callable[.
     wrong = {**seaweed.environment(), 'AWS_SECRET_ACCESS_KEY': 'not-the-secret'}
     talking = talk(processes, wrong)
     talking.publish()
-    talking.node.said('delivery is paused')
+    talking.node.await_log('delivery is paused')
     assert 'the secret key is wrong (check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY' in talking.node.log
     assert 'not-the-secret' not in talking.node.log
     assert talking.node.stop()['objects']['pending'] >= 1
@@ -151,7 +151,7 @@ def test_a_bucket_that_cannot_be_made(processes: Processes, seaweed: Tower, owne
     """Where they do not, the error says how to create it; its objects wait and are delivered once it is there."""
     talking = talk(processes, seaweed.environment('limited'), **{'talk.bucket': 'later'})
     talking.publish()
-    talking.node.said('bucket later gets nothing')
+    talking.node.await_log('bucket later gets nothing')
     assert 's3 mb s3://later' in talking.node.log
     assert talking.node.topic(TOPIC)['stored_in']['delivered'] == 0
     owner.create_bucket(Bucket='later')

@@ -48,7 +48,7 @@ def nodes(shared: Processes) -> dict[str, Node]:
         space: shared.node(None, SENSORS, '-r', f'__ns:={space}', home=space.strip('/'), program=program)
         for space, program in ((DIRECT, ('-m', 'shadowhound_data_logger.node.sensor_logger_node')), (BESIDE, FRONTED))
     }
-    given[BESIDE].said(OFFERED)
+    given[BESIDE].await_log(OFFERED)
     return given
 
 
@@ -169,7 +169,7 @@ def test_front_and_command_line_see_each_other_s_settings(nodes: dict[str, Node]
     node, station = nodes[BESIDE], stations[BESIDE]
     assert station.set(talk__quality=77) == ''
     assert run(node, 'get', 'talk.quality')['values'] == {'talk.quality': 77}
-    node.said('talk.quality = 77 from now on')
+    node.await_log('talk.quality = 77 from now on')
     assert run(node, 'set', 'talk.quality', '66')['ok']
     until(lambda: station.get('talk.quality') == 66, 'the front follows')
     assert station.set(talk__quality=65) == ''
@@ -249,12 +249,12 @@ def test_a_front_that_dies_is_started_again(shared: Processes, nodes: dict[str, 
 def test_the_front_ends_with_the_node(processes: Processes) -> None:
     """When it is asked to end, and when it is killed: within seconds nobody answers for a node that is no more."""
     node = processes.node(None, SENSORS, program=FRONTED)
-    node.said(OFFERED)
+    node.await_log(OFFERED)
     assert len(fronts(node)) == 1
     node.kill()
     until(lambda: not fronts(node), 'the front of a killed node ends', ENDS_S)
     again = processes.node(None, SENSORS, program=FRONTED)
-    again.said(OFFERED)
+    again.await_log(OFFERED)
     again.stop()
     assert fronts(again) == []
     assert 'front failed' not in again.log
@@ -265,8 +265,8 @@ def test_the_name_and_the_rules_of_the_command_line_hold(processes: Processes) -
     node = processes.node(
         None, SENSORS, '-r', '__node:=mine', '-r', 'mine:talk:=heard', '-p', 'mine:talk.priority:=2', program=FRONTED
     )
-    node.said('logging /heard to')
-    node.said(OFFERED)
+    node.await_log('logging /heard to')
+    node.await_log(OFFERED)
     assert run(node, 'get', 'talk.priority')['values'] == {'talk.priority': 2}
     station = Station(processes.environ)
     try:

@@ -295,8 +295,8 @@ def test_two_robots_in_one_graph(processes: Processes) -> None:
             publisher.create(f'/{name}/{topic}', kind)
     nodes = [processes.node(None, None, '-r', f'__ns:=/{name}', robot='') for name in names]
     lost = processes.node(None, None, robot='lost', home='home-of-lost')
-    lost.said('the topics of /robot0 and /robot1 are logged under one name')
-    lost.said('sensor_logger.launch.py robots:=robot0,robot1')
+    lost.await_log('the topics of /robot0 and /robot1 are logged under one name')
+    lost.await_log('sensor_logger.launch.py robots:=robot0,robot1')
     for name, count in zip(names, (5, 7), strict=True):
         for topic, kind in kinds.items():
             publisher.matched(f'/{name}/{topic}', 2)

@@ -82,6 +82,6 @@ def test_a_node_stays_off_the_port_of_a_killed_one(processes: Processes, seaweed
     node.kill()
     publisher.signal(signal.SIGSTOP)  # so that it does not notice first
     again = processes.node(seaweed.environment(), parameters)
-    again.said('that killed processes left are not reused')
+    again.await_log('that killed processes left are not reused')
     publisher.signal(signal.SIGCONT)
     publisher.heard('/killed', again, WARM_UP)

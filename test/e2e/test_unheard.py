@@ -37,8 +37,8 @@ def test_a_publisher_where_our_profile_does_not_look_is_an_error(processes: Proc
         path = os.pathsep.join([str(HERE.parent), *filter(None, [processes.environ.get('PYTHONPATH')])])
         node = processes.node(None, SENSORS, environ={**everywhere, 'PYTHONPATH': path},
                               program=(str(HERE / 'confined_node.py'), str(machines.robot), 'wlan0'))  # fmt: skip
-        node.said('on 10.78.0.1, receive buffer')
-        node.said(SAID)
+        node.await_log('on 10.78.0.1, receive buffer')
+        node.await_log(SAID)
         (line,) = (line for line in node.log.splitlines() if SAID in line)
         assert line.startswith('[ERROR]')
         assert '/there is not fully received: rmw_cyclonedds_cpp finds a publisher that rmw_fastrtps_cpp' in line

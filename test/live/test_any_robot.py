@@ -50,7 +50,7 @@ class Watching:
         self.processes = processes
         robot = Process('robot', [str(PROGRAM), str(MORE)], processes.folder / 'robot.log', processes.environ)
         processes.started.append(robot)
-        robot.said('ready')
+        robot.await_log('ready')
         self.node = processes.node(parameters={'capture.topics': 'sensors'})
         self.live, self.url = processes.page(self.node)
 

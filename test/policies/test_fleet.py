@@ -138,7 +138,7 @@ def test_a_canary_goes_first_and_goes_back_alone(  # noqa: PLR0915 - one story
             until(lambda: tachi.folder.current() == ids[1], lambda: f'it goes back: {service.log}')
             took_s.append(time.monotonic() - began)
         assert statistics.median(took_s) < 1.0, took_s
-        service.said(f'{ids[2]} was rolled back here: 4 steps failed')  # the registry says the same, and is not followed
+        service.await_log(f'{ids[2]} was rolled back here: 4 steps failed')  # the registry says the same, and is not followed
         assert tachi.folder.current() == ids[1]
         assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
         assert [robot.folder.state.read().bad for robot in others] == [{}, {}]

@@ -61,7 +61,7 @@ may have 17 MB. Artifacts are streamed.
 MAX_WRONG, WRONG_S = 10, 60.0
 """After this many wrong passwords within this time an address must wait."""
 MAX_ADDRESSES: Final = 1000
-"""Maximum number of addresses with wrong passwords; beyond it the one that failed least recently is dropped."""
+"""Maximum number of addresses with wrong passwords; beyond it the one with the oldest failure is dropped."""
 LOOPBACK: Final = frozenset({'', '127.0.0.1', '::1'})
 """Addresses that never wait: programs of this machine, such as a reverse proxy in front of all clients."""
 SILENT_S: Final = 20.0

@@ -1,6 +1,6 @@
 """Records one bag on request and uploads it, in a separate process.
 
-   python -m shadowhound_data_logger.node.recording.bag_process NAME --duration 60 [--topic /imu ...] [--regex ...]
+    python -m shadowhound_data_logger.node.recording.bag_process NAME --duration 60 [--topic /imu ...] [--regex ...]
 
 Its last line on standard output is JSON: the result. ``bags.record`` starts it, for the command line and for agents. It records
 as the node does, slice by slice into the spool, with separate subscriptions; SIGINT ends it early with a complete bag.

@@ -4,7 +4,7 @@ Messages interoperate between the DDS vendors, services and parameters do not. S
 services, parameters, ``~/mission`` and ``/diagnostics``, and forwards requests to the node through the control socket. The node
 starts it, and restarts it when it exits; the front exits when the node does, for whatever reason. Logging does not depend on it.
 
-   python -m shadowhound_data_logger.node.reporting.front SOCKET PID [ROS arguments of the node]
+    python -m shadowhound_data_logger.node.reporting.front SOCKET PID [ROS arguments of the node]
 """
 
 from __future__ import annotations
