@@ -41,7 +41,7 @@ FLAGS = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox
 DESKTOP, TALL, PHONE = ({'width': width, 'height': height} for width, height in ((1280, 1000), (1280, 1400), (390, 844)))
 PARAMETERS = {'events.topics': ['/imu', '/camera/compressed'], 'events.pre_s': 3.0, 'events.post_s': 2.0}
 RATES = 'rate_scale:=0.3'
-"""The browser draws without a graphics card, beside the simulator."""
+"""The browser draws without a graphics card, next to the simulator."""
 AWAY_S = 4.0
 """The node is killed for this long."""
 SETTLE_MS = 4000
