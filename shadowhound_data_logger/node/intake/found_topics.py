@@ -91,6 +91,11 @@ class FoundTopics:
                 log.info('%s (%s) is not logged: %s', printable(topic), type_name, why)
         self.not_logged = left_out
 
+    @property
+    def is_of_another_robot(self) -> bool:
+        """Whether it has been looked for a Unitree, and none was found: the default sensors are for one."""
+        return self._is_auto and not self._is_unitree and bool(self._seen)
+
     def _is_own(self, topic: str) -> bool:
         """Whether it belongs to this robot: below the namespace of the node, or tf, which several robots share."""
         return topic in _SHARED or topic.startswith(self._namespace)

@@ -101,6 +101,11 @@ class Intake:
         """Topics that no sensor names and that are not logged, and why."""
         return self._found.not_logged if self._found is not None else {}
 
+    @property
+    def is_of_another_robot(self) -> bool:
+        """Whether the robot is no Unitree, so that topics of the default sensors need not exist."""
+        return self._found is not None and self._found.is_of_another_robot
+
     def status(self) -> list[SubscriberStatus]:
         return [subscriber.status() for subscriber in self._subscribers]
 

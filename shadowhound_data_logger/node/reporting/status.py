@@ -175,7 +175,10 @@ class Status:
         totals = self._stages.spool.accounts.totals()
         sources = {source.topic: source for source in self._stages.intake.status()}
         topics = dict.fromkeys((*sources, *totals))
-        return {topic: self._topic(topic, sources.get(topic), totals.get(topic, _NOTHING), now_s) for topic in topics}
+        rows = {topic: self._topic(topic, sources.get(topic), totals.get(topic, _NOTHING), now_s) for topic in topics}
+        if not self._stages.intake.is_of_another_robot:
+            return rows
+        return {topic: row for topic, row in rows.items() if row.publishers or row.received or not row.enabled}
 
     def _topic(self, topic: str, source: SubscriberStatus | None, totals: Totals, now_s: float) -> TopicStatus:
         rate_hz = 0.0
