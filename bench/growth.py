@@ -41,6 +41,7 @@ def grow(options: argparse.Namespace, parameters: Mapping[str, Any], arguments: 
         took = time.monotonic() - start
         cpu, busy = node.cpu_s() - cpu, _proc.busy_s() - busy
         memory = _proc.memory(node.pid)
+        behind_s = settle(world, sink)
         node.stop()
         found = world.ledger()
     rows = [row for topic, row in found[sink].items() if topic.startswith('/grown/')]
@@ -49,8 +50,19 @@ def grow(options: argparse.Namespace, parameters: Mapping[str, Any], arguments: 
     return {
         'cpu': 100 * cpu / took, 'busy': busy / took, 'memory_mb': memory.resident, 'received': received,
         'lost': missed + dropped, 'reached': told['published'] / told['seconds'] / max(1, len(rows)) / rate_hz,
-        'us': 1e6 * cpu / told['published'], 'topics': len(rows), 'balanced': found['balanced'],
+        'behind_s': behind_s, 'us': 1e6 * cpu / told['published'], 'topics': len(rows), 'balanced': found['balanced'],
     }  # fmt: skip
+
+
+def settle(world: World, sink: str) -> float:
+    """Seconds until no message waits in the node any more; ``SETTLE_S`` if some still do."""
+    start = time.monotonic()
+    while (waited := time.monotonic() - start) < SETTLE_S:
+        time.sleep(0.2)
+        rows = [row for topic, row in world.ledger()[sink].items() if topic.startswith('/grown/')]
+        if rows and not any(row['open'] for row in rows):
+            return waited
+    return SETTLE_S
 
 
 def measure(options: argparse.Namespace) -> Report:
