@@ -168,7 +168,7 @@ print([name for name in ('deltalake', 'obstore', 'pyarrow') if name in sys.modul
     assert ran.stdout.strip() == '[]'
 
 
-def test_the_words_of_metadata_are_told() -> None:
+def test_metadata_keys_are_documented() -> None:
     """Each word is defined once, and the page on formats says what it means."""
     words = {name: word for name, word in vars(metadata_keys).items() if name.isupper()}
     page = (ROOT.parent / 'docs' / 'formats.md').read_text(encoding='utf-8')
@@ -217,7 +217,7 @@ def test_the_public_face_is_light() -> None:
     assert sum(name.startswith(f'{PACKAGE}.') for name in json.loads(ran.stdout)) < 60
 
 
-def test_the_public_names_are_told() -> None:
+def test_public_names_are_documented() -> None:
     """``__all__`` is explicit, and every name in it is there."""
     module = __import__(PACKAGE)
     assert isinstance(module.__all__, list)

@@ -110,7 +110,7 @@ def imported() -> set[str]:
     return {PACKAGES.get(name, name) for name in found - stdlib - ROS - {Path(folder).name for folder in OURS}}
 
 
-def test_what_is_imported_is_asked_for_or_comes_with_what_is() -> None:
+def test_every_import_is_a_dependency() -> None:
     """By setup.py, or by what docs/dependencies.md says of it; and that names nothing that is not imported."""
     told = setup_arguments()
     asked = [*told['install_requires'], *(each for extra in told['extras_require'].values() for each in extra)]
@@ -148,12 +148,12 @@ def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -
 
 
 @pytest.mark.parametrize('lock', ['robot.txt', 'sourced.txt', 'jazzy.txt'])
-def test_beside_a_sourced_ros_numpy_stays_at_1(lock: str) -> None:
+def test_with_a_sourced_ros_numpy_stays_at_1(lock: str) -> None:
     """The message packages of Humble and Jazzy were compiled against numpy 1 and crash on numpy 2."""
     assert set(re.findall(r'^numpy==(\d+)\.', (REQUIREMENTS / lock).read_text(), re.MULTILINE)) == {'1'}
 
 
-def test_beside_lyrical_numpy_and_empy_are_free() -> None:
+def test_with_lyrical_numpy_and_empy_are_unpinned() -> None:
     """Its message packages are compiled against numpy 2, and its rosidl takes empy 4."""
     text = (REQUIREMENTS / 'lyrical.txt').read_text()
     assert set(re.findall(r'^numpy==(\d+)\.', text, re.MULTILINE)) == {'2'}
@@ -212,7 +212,7 @@ def test_a_commit_is_checked_as_make_check_does() -> None:
     assert [hook['entry'] for hook in repository['hooks']] == [line.strip() for line in rule[1].splitlines()]
 
 
-def test_with_env_says_what_to_do_when_there_is_no_environment(tmp_path: Path) -> None:
+def test_with_env_without_an_environment_has_a_remedy(tmp_path: Path) -> None:
     """In a fresh clone it names `make setup` and fails."""
     (tmp_path / 'scripts').mkdir()
     script = shutil.copy(ROOT / 'scripts' / 'with-env', tmp_path / 'scripts')

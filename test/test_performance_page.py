@@ -43,7 +43,7 @@ def test_what_another_vendors_messages_cost_is_on_the_page(page: Any) -> None:
     assert '<!-- bench vendors -->' in PAGE.read_text(encoding='utf-8')
 
 
-def test_what_was_not_measured_says_so(page: Any) -> None:
+def test_a_missing_measurement_is_marked(page: Any) -> None:
     assert '*not measured*' in page.filled('<!-- bench vendors -->\n<!-- end vendors -->\n', {'benches': {}})
 
 

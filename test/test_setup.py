@@ -99,7 +99,7 @@ def test_one_that_makes_environments(machine: Machine) -> None:
     assert machine.taken() == str(serves)
 
 
-def test_what_is_missing_is_said(machine: Machine) -> None:
+def test_missing_programs_are_reported(machine: Machine) -> None:
     """A Python that lacks nothing but venv is named, with the package that has it."""
     machine.python('PATH', '3.11', makes_venvs=False)
     said = machine.setup()

@@ -31,7 +31,7 @@ def test_all_that_is_bundled_has_a_version_a_license_and_a_hash(supply_chain: An
         assert [(one['alg'], len(one['content'])) for one in each['hashes']] == [('SHA-512', 128)]
 
 
-def test_a_bill_says_of_what_it_is_one(supply_chain: Any, tmp_path: Path) -> None:
+def test_a_bill_of_materials_names_its_subject(supply_chain: Any, tmp_path: Path) -> None:
     """Of this package and its version, beside what its tool says of itself."""
     target = tmp_path / 'a.cdx.json'
     supply_chain.write(target, {'bomFormat': 'CycloneDX', 'metadata': {'tools': {'components': []}}, 'components': []})
@@ -56,7 +56,7 @@ def test_a_machine_without_the_database_skips_the_audit(
     assert out.endswith('; it has never been reached from here\n')
 
 
-def test_an_audit_that_is_skipped_says_when_one_was_not(
+def test_a_skipped_audit_names_the_last_one(
     supply_chain: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """The time of the last answer and its age in days; a damaged note is unknown, and not an error."""
@@ -77,7 +77,7 @@ def test_an_audit_that_is_skipped_says_when_one_was_not(
         assert 'when it was reached last is unknown' in capsys.readouterr().out
 
 
-def test_what_is_known_is_told_once(
+def test_known_vulnerabilities_are_reported_once(
     supply_chain: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """A package of several lock files is one finding; what the database does not know counts as not asked."""

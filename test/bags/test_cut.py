@@ -132,7 +132,7 @@ def test_bags_of_others(tmp_path: Path, plugin: StoragePlugin, mode: Compression
     assert 'float64[9] orientation_covariance' in channel.definition
 
 
-def test_a_piece_tells_qos_as_humble_reads_it(tmp_path: Path) -> None:
+def test_a_cut_has_qos_in_humbles_format(tmp_path: Path) -> None:
     """Jazzy and Kilted record it in words, at which Humble's player ends."""
     folder = tmp_path / 'kilted'
     folder.mkdir()
@@ -165,7 +165,7 @@ def test_the_clock_of_a_bag_is_that_of_its_piece(tmp_path: Path, clock: dict[str
     {'clock': 'set_later', 'boot_id': 'b', 'clock_offset_ns': '1760788778000000000'}, {'clock': 'unset', 'boot_id': 'b'}, {},
 ])  # fmt: skip
 @pytest.mark.parametrize('without', ['metadata', 'm'], ids=['without metadata.yaml', 'without manifest.json as well'])
-def test_slices_in_a_store_tell_the_clock_of_a_bag_that_is_not_whole(tmp_path: Path, clock: dict[str, str], without: str) -> None:
+def test_slices_in_a_store_give_the_clock_of_an_incomplete_bag(tmp_path: Path, clock: dict[str, str], without: str) -> None:
     """Its metadata.yaml has not come yet: to who cuts it, asks for it, or fetches it."""
     store, folder = MemoryStore(), tmp_path / 'early'
     write_ours(folder, slices=2, each=20)
@@ -187,7 +187,7 @@ def test_slices_in_a_store_tell_the_clock_of_a_bag_that_is_not_whole(tmp_path: P
     {'clock': 'set_later', 'boot_id': 'b'}, {'clock': 'set_later', 'boot_id': 'b', 'clock_offset_ns': '9' * 5000},
     {'clock': 'set_later', 'boot_id': 'b' * 5000, 'clock_offset_ns': '1'}, {'clock': 'unset'}, {'clock': 'set'},
 ])  # fmt: skip
-def test_a_clock_that_nobody_wrote_is_none(tmp_path: Path, custom: dict[str, str]) -> None:
+def test_a_missing_clock_is_none(tmp_path: Path, custom: dict[str, str]) -> None:
     """Of others' custom data nothing is believed."""
     infos = write_ours(tmp_path / 'early', slices=1, each=2, is_ended=False)
     (tmp_path / 'early' / 'metadata.yaml').write_bytes(metadata_yaml(infos, ros_distro='humble', custom_data=custom))
@@ -204,7 +204,7 @@ def test_a_clock_that_nobody_wrote_is_none(tmp_path: Path, custom: dict[str, str
     (Choice('noon'), SettingError, '--start'),
     (Choice(regex='('), SettingError, '--regex'),
 ])  # fmt: skip
-def test_a_cut_of_nothing_leaves_nothing(
+def test_an_empty_cut_leaves_no_files(
     store: MemoryStore, tmp_path: Path, choice: Choice, error: type[Exception], text: str
 ) -> None:
     """It says what there is instead."""
@@ -225,7 +225,7 @@ def test_others_may_read_a_piece_as_they_may_any_file(origin: Path, tmp_path: Pa
     }  # fmt: skip
 
 
-def test_what_is_not_there_is_told(origin: Path, tmp_path: Path) -> None:
+def test_a_missing_bag_is_reported(origin: Path, tmp_path: Path) -> None:
     """A topic that the bag does not have; a slice that has not arrived: of its time nothing is made up, nor called nothing."""
     store = MemoryStore()
     stored(store, origin, without='_1.mcap')

@@ -38,7 +38,7 @@ def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:
         assert not list(it.root.iterdir())
 
 
-def test_the_manifest_says_who_asked_for_it(tmp_path: Path) -> None:
+def test_the_manifest_names_the_requester(tmp_path: Path) -> None:
     """Each trigger has the operator at the page, in addition to its time, if the operator is known."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(10))
@@ -182,7 +182,7 @@ def test_it_ships_first_and_is_never_evicted(tmp_path: Path, monkeypatch: pytest
         assert {item.metadata['event'] for item in given} == {'fall'}
 
 
-def test_it_says_in_which_mission_it_was(tmp_path: Path) -> None:
+def test_the_manifest_names_the_mission(tmp_path: Path) -> None:
     """With the run's id, though that became known later."""
     with buffer(tmp_path) as it:
         it.events.on_mission(mission())
@@ -240,7 +240,7 @@ def test_without_topics_there_is_nothing(tmp_path: Path) -> None:
         )  # fmt: skip
 
 
-def test_other_settings_are_in_force_at_once(tmp_path: Path) -> None:
+def test_changed_settings_apply_immediately(tmp_path: Path) -> None:
     """Those that are live: how far back, how long, and how many bytes."""
     with buffer(tmp_path) as it:
         it.events.update(EventSettings(topics=('/talk',), pre_s=2.0, post_s=1.0, max_s=10.0, max_bytes=2 << 20))

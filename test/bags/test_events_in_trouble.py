@@ -68,7 +68,7 @@ def test_it_takes_from_the_ring_what_it_writes(tmp_path: Path, monkeypatch: pyte
         assert len(in_bag(it, only_bag(it))) == 15
 
 
-def test_a_disk_without_room_costs_the_event_and_nothing_else(tmp_path: Path) -> None:
+def test_a_full_disk_loses_only_the_event(tmp_path: Path) -> None:
     """What it takes nothing of is dropped and counted, and the next event is whole."""
     with buffer(tmp_path) as it:
         it.room[0] = False
@@ -108,7 +108,7 @@ def killed(home: Path, it: Buffer) -> Path:
     return kill(home)
 
 
-def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What reached the disk is in the event's bag, which says that the rest is missing; the ledger closes."""
     monkeypatch.setattr('shadowhound_data_logger.bags.events.SYNC_S', 3600.0)  # the second trigger syncs
     home = tmp_path / 'home'

@@ -91,7 +91,7 @@ def test_a_second_run_downloads_nothing(store: Counting, tmp_path: Path) -> None
     assert files(folder) == files(tmp_path / 'robot' / NAME)
 
 
-def test_it_goes_on_where_it_broke_off(store: Counting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_fetch_resumes(store: Counting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over the runs each byte comes once."""
     monkeypatch.setattr(retry, 'BASE_S', 0.0)
     bag = find_bag(store, 'thor', NAME)
@@ -114,7 +114,7 @@ def test_a_part_that_lost_its_content_is_downloaded_again(store: Counting, tmp_p
     assert files(folder) == files(tmp_path / 'robot' / NAME)
 
 
-def test_what_the_store_lost_is_said_and_not_kept(store: Counting, tmp_path: Path) -> None:
+def test_files_lost_in_the_store_are_reported(store: Counting, tmp_path: Path) -> None:
     """A slice that is not what the manifest promises never gets its name."""
     other = tmp_path / 'other.bin'
     other.write_bytes(b'x' * 1000)
@@ -160,7 +160,7 @@ def test_a_bag_of_which_a_slice_is_missing_can_be_opened_and_completed(tmp_path:
     assert files(tmp_path / NAME) == files(folder)
 
 
-def test_a_foreign_bag_is_fetched_as_it_is(tmp_path: Path) -> None:
+def test_a_foreign_bag_is_fetched_unchanged(tmp_path: Path) -> None:
     """Files that another program uploaded without a checksum are reported as such."""
     write_rosbags(tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'theirs', StoragePlugin.SQLITE3, CompressionMode.NONE)
     store = DirectoryStore(tmp_path / 'store')

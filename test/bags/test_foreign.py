@@ -69,7 +69,7 @@ ENCODINGS = {
 
 @pytest.mark.parametrize('name', ENCODINGS)
 @pytest.mark.parametrize('is_chunked', [True, False])
-def test_what_is_not_decoded_is_copied_as_it_is(tmp_path: Path, name: str, is_chunked: bool) -> None:
+def test_undecoded_messages_are_copied_verbatim(tmp_path: Path, name: str, is_chunked: bool) -> None:
     """Encoding, schema and its bytes, the channel's metadata, both times, the sequence number, the profile."""
     encoding, schema, data, metadata = ENCODINGS[name]
 

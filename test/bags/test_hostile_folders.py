@@ -76,7 +76,7 @@ def test_what_is_no_slice_is_set_aside(folder: Path, tmp_path: Path) -> None:
     assert (aside / 'x.mcap.open').read_bytes() == b'before'
 
 
-def test_a_bag_that_cannot_be_made_whole_keeps_none_of_the_others(folder: Path, tmp_path: Path) -> None:
+def test_a_broken_bag_does_not_block_others(folder: Path, tmp_path: Path) -> None:
     """It is tried again; the bags after it are completed during that time, and the node records."""
     later = folder.with_name('patrol_20251018_130000')
     later.mkdir()

@@ -144,7 +144,7 @@ def test_after_a_crash_repeats_are_not_received_either(tmp_path: Path, *, is_los
         assert [each['repeated'] for each in said['slices']] == [{}, {STATIC: 1}]
 
 
-def test_a_slice_of_repeats_alone_is_none(tmp_path: Path) -> None:
+def test_a_slice_of_only_repeats_is_not_written(tmp_path: Path) -> None:
     """A split without messages after it leaves no slice, nor does a crash then."""
     with desk(tmp_path) as it:
         bag = start(it.recorder)

@@ -108,7 +108,7 @@ def test_what_is_wrong_is_named(place: str, value: object) -> None:
     assert place in str(refused.value)
 
 
-def test_a_later_version_may_say_more() -> None:
+def test_a_newer_manifest_may_have_more_fields() -> None:
     """Fields that are not known are ignored."""
     found = {**json.loads(WHOLE.to_json()), 'color': 'blue'}
     assert Manifest.from_json(json.dumps(found).encode()) == WHOLE

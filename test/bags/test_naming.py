@@ -23,7 +23,7 @@ def test_names() -> None:
 
 
 @pytest.mark.parametrize('what', ['a/b', '..', 'a..b', 'über den Berg', '\u202e\ud800', 'x' * 300, 'x.' * 40, '-', '\0\n', ' '])
-def test_a_bag_of_any_mission_has_a_name_that_can_be_asked_for(what: str) -> None:
+def test_every_mission_gives_a_valid_bag_name(what: str) -> None:
     """Whatever an agent calls its mission: one part of a key, a file name with its slices', and one that the verbs take."""
     for name in (bag_name(what, NOON_NS, lambda _: False), unsynced_name(f'event_{what}', BOOT, 12 * 10**9, lambda _: False)):
         assert check_name(name, 'the bag', MAX_BAG_BYTES) == name

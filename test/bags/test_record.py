@@ -79,7 +79,7 @@ def test_other_topics_and_nothing(home: Path) -> None:
 
 
 @long
-def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
+def test_the_next_recorder_uploads_the_bag_of_a_killed_one(home: Path) -> None:
     """Kill -9 while it records: the next recording makes it whole and says what may be missing."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
     child = subprocess.Popen([sys.executable, '-m', program, '--robot=thor', '--duration=60', '--topic=/odom', 'cut_off'])
@@ -98,7 +98,7 @@ def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
 
 
 @long
-def test_the_spools_index_is_damaged_meanwhile(home: Path) -> None:
+def test_the_index_is_damaged_during_a_recording(home: Path) -> None:
     """The bag is completed and another one follows; both are in the store, and the call returns the last one."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
     command = [sys.executable, '-m', program, '--robot=thor', '--duration=60', '--topic=/odom', 'patrol']

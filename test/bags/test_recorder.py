@@ -196,7 +196,7 @@ def test_a_bag_that_cannot_be_ended_does_not_keep_the_next_one_from_beginning(
         assert it.row()['dropped'] == {}
 
 
-def test_what_somebody_started_outlives_missions(tmp_path: Path) -> None:
+def test_a_bag_started_by_the_operator_continues_after_missions(tmp_path: Path) -> None:
     """A bag that a service began ends when a service says so."""
     with desk(tmp_path, record='mission') as it:
         name = start(it.recorder)
@@ -229,9 +229,7 @@ def _copy(source: str, target: str) -> None:
 
 
 @pytest.mark.parametrize('synced', [True, False])
-def test_what_a_kill_leaves_is_made_whole_by_the_next_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synced: bool
-) -> None:
+def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synced: bool) -> None:
     """Closed slices and what was synced of the open one are spooled; the rest is lost by the restart, as the manifest says."""
     home = tmp_path / 'home'
     monkeypatch.setattr('shadowhound_data_logger.bags.recorder.SYNC_S', 3600.0)

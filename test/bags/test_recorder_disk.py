@@ -23,7 +23,7 @@ from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import ledger
 
 
-def test_a_disk_without_room_costs_what_comes_meanwhile(tmp_path: Path) -> None:
+def test_a_full_disk_loses_only_messages_of_that_time(tmp_path: Path) -> None:
     """The slice is closed and spooled, messages are dropped as no_room, and the recording continues once there is room."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
@@ -43,7 +43,7 @@ def test_a_disk_without_room_costs_what_comes_meanwhile(tmp_path: Path) -> None:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_the_manifest_and_what_the_store_is_told_of_gaps_agree(tmp_path: Path) -> None:
+def test_manifest_and_gap_parts_agree(tmp_path: Path) -> None:
     """What was dropped for want of room: as many messages by topic and reason in both."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
@@ -173,7 +173,7 @@ def test_slices_that_the_full_spool_gave_up_are_in_the_manifest(tmp_path: Path) 
         assert (row['stored'], row['stored_in']['evicted']) == (80, sum(count for count, *_ in lost.values()))
 
 
-def test_slices_that_are_given_up_after_the_end_are_told_on_the_robot(tmp_path: Path) -> None:
+def test_slices_evicted_after_the_end_are_reported_on_the_robot(tmp_path: Path) -> None:
     """Their manifest was made already: the list says why they never come."""
     with desk(tmp_path, slice_bytes=1 << 20, spool={'max_bytes': 4 << 20}) as it:
         start(it.recorder)

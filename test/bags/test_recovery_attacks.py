@@ -30,7 +30,7 @@ def foreign(path: Path, bag: str, robot: str, owner: str) -> None:
     writer.close()
 
 
-def test_a_slice_of_another_recording_tells_nothing_of_this_one(tmp_path: Path) -> None:
+def test_a_slice_of_another_recording_is_ignored(tmp_path: Path) -> None:
     """It is spooled as a slice of the folder in which it is, or set aside; the bag keeps its name."""
     folder = tmp_path / 'bags' / ROBOT / BAG
     folder.mkdir(parents=True)

@@ -34,7 +34,7 @@ def test_a_complete_bag(tmp_path: Path) -> None:
     assert (found.t_start_ns, found.t_end_ns, found.finding) == (T0, T0 + 14_990_000_000, '')
 
 
-def test_a_growing_bag_is_told_by_its_slices(tmp_path: Path) -> None:
+def test_a_growing_bag_is_described_by_its_slices(tmp_path: Path) -> None:
     """In the store one, in the recording folder a closed one and the open one; nothing is opened for it."""
     store, recording = MemoryStore(), tmp_path / 'home' / 'bags' / 'thor' / NAME
     write_ours(recording, slices=2, is_ended=False)
@@ -82,7 +82,7 @@ def test_only_those_since(tmp_path: Path) -> None:
     assert bag_overview(store, 'tachi', tmp_path) == []
 
 
-def test_a_name_that_is_none_is_answered_with_near_ones(tmp_path: Path) -> None:
+def test_an_unknown_name_suggests_similar_ones(tmp_path: Path) -> None:
     """A slip of the hand is the commonest error."""
     store = MemoryStore()
     write_ours(tmp_path / NAME, slices=1, each=10)

@@ -168,7 +168,7 @@ def test_without_senders_as_many_are_latched_as_there_are() -> None:
     assert of_event(ring) == [('/tf_static', None, [2], True), ('/tf_static', None, [3], True)]
 
 
-def test_an_event_without_anything_else_begins_with_what_is_latched() -> None:
+def test_an_event_starts_with_latched_messages() -> None:
     """Now; and one that is over leaves nothing for the next."""
     ring = Ring(1 << 20, KEEP_S)
     ring.put(latched(1), None, 0.0)

@@ -41,7 +41,7 @@ def state(tmp_path: Path) -> BagState:
     return made
 
 
-def test_it_is_read_as_it_was_told(state: BagState) -> None:
+def test_state_round_trips(state: BagState) -> None:
     """From the index and from the next slice; the slices have the definitions, which are not repeated."""
     (_, rows) = state.all_rows()
     assert BagState.of_rows(state.folder, 'thor', rows) == state
@@ -50,7 +50,7 @@ def test_it_is_read_as_it_was_told(state: BagState) -> None:
     assert state.slices['b_1.mcap'].counts == {'/pose': 0, '/imu': 3}
 
 
-def test_each_change_is_told_alone(state: BagState) -> None:
+def test_each_record_has_only_changes(state: BagState) -> None:
     """Each loss has its own number, so a loss that is stored twice exists once."""
     rows = state.add_missing(Missing('b_1.mcap', 'more', 1))
     assert ([one.place for one in rows.missing], rows.slices) == ([2], ())
@@ -76,7 +76,7 @@ def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> Non
     assert found.missing[0].what == f'the index was lost: {left_out} earlier slices or losses are not listed here'
 
 
-def test_what_a_slice_says_later_counts(tmp_path: Path) -> None:
+def test_the_last_record_of_a_slice_counts(tmp_path: Path) -> None:
     """A trigger or a mission's run that became known while it was written."""
     state = BagState.begin(tmp_path / 'b', 'thor', MissionOf('patrol', 'patrol_1', None))
     writer = SliceWriter(tmp_path / 'b' / 'b_0.mcap')

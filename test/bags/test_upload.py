@@ -60,7 +60,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(('plugin', 'mode'), KINDS, ids=lambda value: value.name)
-def test_any_finished_bag_arrives_as_it_is(
+def test_finished_bags_are_uploaded_unchanged(
     settings: Settings, store: DirectoryStore, tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
 ) -> None:
     """With a manifest that has its checksums; the folder is unchanged."""
@@ -115,7 +115,7 @@ def test_an_archive_is_the_guides(settings: Settings, store: DirectoryStore, tmp
 
 
 @pytest.mark.long('an outage of some seconds')
-def test_an_away_tower_is_no_failure(tmp_path: Path, seaweed: Tower) -> None:
+def test_an_unreachable_tower_is_not_a_failure(tmp_path: Path, seaweed: Tower) -> None:
     """The bag waits in the spool, whatever becomes of its folder, and the next process delivers it."""
     settings = Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0},
                              {'SHADOWHOUND_HOME': str(tmp_path / 'home'), 'AWS_ENDPOINT_URL': 'http://127.0.0.1:9'})  # fmt: skip
@@ -132,7 +132,7 @@ def test_an_away_tower_is_no_failure(tmp_path: Path, seaweed: Tower) -> None:
         assert verify_remote(store, find_bag(store, 'thor', NAME), deep=True).state == 'complete'
 
 
-def test_a_spool_without_room_says_so(tmp_path: Path) -> None:
+def test_a_full_spool_is_reported(tmp_path: Path) -> None:
     """The remedy is to go past it."""
     settings = Settings.load(
         {'spool.max_bytes': 1 << 20, 'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path / 'home')}
@@ -245,7 +245,7 @@ def test_a_watched_bag_is_shipped_once_it_is_finished(settings: Settings, store:
     assert len(find_bag(store, 'thor', NAME).files) == 6
 
 
-def test_a_bag_that_nobody_finishes_is_told_once(settings: Settings, tmp_path: Path) -> None:
+def test_an_unfinished_bag_is_reported_once(settings: Settings, tmp_path: Path) -> None:
     """After ten minutes without a change it is reported, not sent; it becomes normal again once its recorder continues."""
     folder = tmp_path / 'recordings'
     write_ours(folder / NAME, is_ended=False)

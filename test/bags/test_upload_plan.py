@@ -21,7 +21,7 @@ BOMB = b'a: &a [x, x]\n' + b''.join(
     b'rosbag2_bagfile_information: &x {starting_time: *x, relative_file_paths: *x}\n',
     b'rosbag2_bagfile_information: !!python/object/apply:os.system ["true"]\n', b'#' + b'x' * (5 << 20),
 ], ids=['empty', 'zeros', 'no text', 'a list', 'deep', 'deeper', 'a bomb', 'itself', 'a program', 'huge'])  # fmt: skip
-def test_a_metadata_that_is_none_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_invalid_metadata_is_rejected(tmp_path: Path, content: bytes) -> None:
     """In a moment, and as what it is."""
     write_ours(tmp_path / NAME, slices=1, each=5)
     (tmp_path / NAME / 'metadata.yaml').write_bytes(content)

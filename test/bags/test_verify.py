@@ -37,14 +37,14 @@ def remotely(folder: Path, *, deep: bool) -> VerifiedBag:
 
 
 @pytest.mark.parametrize('deep', [False, True])
-def test_a_whole_bag_is_sound(folder: Path, deep: bool) -> None:
+def test_an_intact_bag_passes(folder: Path, deep: bool) -> None:
     """In a folder, and in a store."""
     for found in (verify_folder(folder, deep=deep), remotely(folder, deep=deep)):
         assert (found.state, found.findings) == ('complete', ())
         assert len(found.checks) == 3
 
 
-def test_a_store_is_asked_for_little(folder: Path) -> None:
+def test_a_store_is_read_sparingly(folder: Path) -> None:
     """Without --deep no slice is downloaded: its summary is enough; with it every byte is read once, and the summaries."""
     store = MemoryStore()
     stored(store, folder)
@@ -93,7 +93,7 @@ def test_a_bag_without_a_manifest_is_held_against_its_metadata(folder: Path) -> 
     assert [check.finding for check in verify_folder(folder).findings] == ['is missing']
 
 
-def test_a_growing_bag_is_told(folder: Path) -> None:
+def test_a_growing_bag_is_reported(folder: Path) -> None:
     """Its slices are sound, and it is not complete."""
     store = MemoryStore()
     for name in (FIRST, f'{NAME}_1.mcap'):
@@ -135,7 +135,7 @@ def test_a_broken_manifest_is_a_finding(folder: Path) -> None:
     assert len(found.checks) == 4
 
 
-def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_a_bag_is_reported(tmp_path: Path) -> None:
     """An empty folder, or one of other things."""
     with pytest.raises(BagError, match='is not a bag'):
         verify_folder(tmp_path)

@@ -49,7 +49,7 @@ def told(home: Path, *arguments: str) -> Any:
     return json.loads(found.output)
 
 
-def test_an_answer_by_value_says_what_was_opened_what_is_unknown_and_up_to_when_it_is_fresh(home: Path) -> None:
+def test_an_answer_by_value_states_its_coverage(home: Path) -> None:
     """The watermark, where that is before the newest object; as JSON with all of it."""
     found = run(home, 'query', '--when', 's.a > 10')
     assert found.output.splitlines()[1:] == [
@@ -62,7 +62,7 @@ def test_an_answer_by_value_says_what_was_opened_what_is_unknown_and_up_to_when_
     assert found['fresh'][0]['fresh'] == '2026-10-28T12:07:00.000000000Z'
 
 
-def test_labels_are_added_listed_removed_and_asked_for(home: Path, tmp_path: Path) -> None:
+def test_labels_are_added_listed_removed_and_queried(home: Path, tmp_path: Path) -> None:
     """By times of an answer, by object, with a box, from a CSV and from COCO; as a filter and a column of ``query``."""
     ranges = tmp_path / 'high.json'
     ranges.write_text(run(home, 'query', '--when', 's.a > 10', '--json').output, encoding='utf-8')

@@ -113,7 +113,7 @@ def test_upload_and_watch(home: Path, tmp_path: Path) -> None:
     assert sorted(names) == ['by_hand', 'by_hand.tar.gz', 'named', NAME]
 
 
-def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> None:
+def test_an_unreachable_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> None:
     """Exit code 1 and why; a list says that the store is away, and what is here all the same."""
     write_ours(tmp_path / 'by_hand', slices=1, each=20)
     away = {'AWS_ENDPOINT_URL': 'http://127.0.0.1:9', 'AWS_ACCESS_KEY_ID': 'k', 'AWS_SECRET_ACCESS_KEY': 's'}
@@ -135,7 +135,7 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
     (('verify', './nowhere'), Exception, 'there is no folder'),
     (('info', 'a b'), Exception, 'cannot be part of an object key'),
 ])  # fmt: skip
-def test_errors_say_what_to_do(home: Path, arguments: tuple[str, ...], error: type[Exception], text: str) -> None:
+def test_errors_have_remedies(home: Path, arguments: tuple[str, ...], error: type[Exception], text: str) -> None:
     """By name, value and remedy."""
     found = run(home, *arguments)
     assert isinstance(found.exception, error)
@@ -188,7 +188,7 @@ def test_help_is_enough(verb: str) -> None:
     assert all(option.help for option in command.params if isinstance(option, click.Option))
 
 
-def test_pages_of_a_bag_whose_times_are_a_counter(tmp_path: Path) -> None:
+def test_a_bag_with_counters_as_times(tmp_path: Path) -> None:
     """Some 400 ns have no rates, shares stay below 100 %, one is no plural, and a file in a folder needs no fetch."""
     home, folder = tmp_path / 'home', tmp_path / 'b'
 
@@ -250,7 +250,7 @@ def test_repair(tmp_path: Path) -> None:
     assert run(tmp_path, 'repair', folder, '--in-place').return_value == 0
 
 
-def test_a_torn_bag_says_how_it_is_repaired(tmp_path: Path) -> None:
+def test_a_torn_bag_has_a_remedy(tmp_path: Path) -> None:
     """Whichever verb comes upon it."""
     folder = tmp_path / NAME
     write_ours(folder)

@@ -106,7 +106,7 @@ def test_bad_usage(found: list[model.Result], tmp_path: Path, arguments: tuple[s
     assert words in f'{error.format_message()} {getattr(error, "remedy", "")}'
 
 
-def test_a_parameter_file_that_is_none(found: list[model.Result], tmp_path: Path) -> None:
+def test_an_invalid_parameter_file(found: list[model.Result], tmp_path: Path) -> None:
     """Is bad usage as well, and names the file."""
     (tmp_path / 'a.yaml').write_text('- no mapping')
     error = run(tmp_path, '--params-file', str(tmp_path / 'a.yaml')).exception

@@ -116,7 +116,7 @@ def cutting(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
 
 @pytest.mark.parametrize('files', [0, 1, 5])
-def test_a_drop_whose_upload_was_cut_off(machines: tuple[Machine, Machine], cutting: Callable[[int], None], files: int,
+def test_a_drop_with_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None], files: int,
                                          tmp_path: Path) -> None:  # fmt: skip
     """The other machine waits for it rather than bring the mission back; told again, the first one takes it out."""
     a, b = machines
@@ -135,7 +135,7 @@ def test_a_drop_whose_upload_was_cut_off(machines: tuple[Machine, Machine], cutt
     assert a.add('one') == []
 
 
-def test_an_export_whose_upload_was_cut_off(machines: tuple[Machine, Machine], cutting: Callable[[int], None]) -> None:
+def test_an_export_with_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None]) -> None:
     """A mission is taken out of what only this machine has yet, and of what of it was uploaded."""
     a, b = machines
     a.add('one')

@@ -74,7 +74,7 @@ def test_what_cannot_be_fetched_is_a_finding(home: Path) -> None:
     assert len(files(home)) == 4
 
 
-def test_a_repeat_asks_for_nothing_of_its_own(home: Path) -> None:
+def test_a_repeat_is_not_fetched_twice(home: Path) -> None:
     """What was stored once and seen again has two rows of one key: it is one object, which is fetched, and both rows are kept."""
     again = {**row('odom', TIMES[0]), **dict.fromkeys(('t_start_ns', 't_end_ns'), TIMES[4] + SECOND)}
     again |= {name: again[f'{name}_ns'] // 1000 for name in ('t_start', 't_end')}

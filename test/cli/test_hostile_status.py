@@ -100,7 +100,7 @@ def test_a_file_that_is_no_document(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize('started', ['', 'yesterday', '9999-99-99T00:00:00Z', '2026-11-20T12:00:00+25:00', 'Z'])
-def test_a_mission_whose_start_is_no_time(tmp_path: Path, started: str) -> None:
+def test_a_mission_with_an_invalid_start(tmp_path: Path, started: str) -> None:
     """It is shown, and its start is unknown."""
     write(
         tmp_path,

@@ -59,7 +59,7 @@ def test_an_empty_store_is_no_error(tmp_path: Path) -> None:
     assert run(tmp_path, 'ingest').exit_code == 0
 
 
-def test_reindex_says_what_it_found(home: Path) -> None:
+def test_reindex_reports_its_result(home: Path) -> None:
     """Rows of objects that are gone are counted, objects without a row get one."""
     told = json.loads(run(home, 'reindex', '--robot', 'thor', '--json').output)
     assert told == {'listed': 2, 'added': 2, 'parts': 1, 'gone': 192}
@@ -74,7 +74,7 @@ def ended(home: Path, *arguments: str) -> Result:
     return CliRunner().invoke(lake, arguments, env=env, standalone_mode=False)
 
 
-def test_prune_says_what_goes_and_asks_before_all_of_a_sensor_does(home: Path) -> None:
+def test_prune_lists_deletions_and_confirms_a_complete_sensor(home: Path) -> None:
     """Without a terminal it then does nothing; a dry run never does; what is referred to is named before it is forced."""
     rules = ('prune', '--keep', 'camera 2026-10-29, odom forever, lidar 1d')
     dry = ended(home, *rules, '--dry-run')
@@ -164,7 +164,7 @@ def test_coverage_as_a_picture(told: Path, tmp_path: Path) -> None:
     assert colors >= {(0x1F, 0x6F, 0xB2), (0xC0, 0x39, 0x2B), (0x9C, 0xC4, 0xE4), (0xC7, 0xCF, 0xD6)}
 
 
-def test_coverage_of_what_nobody_told(told: Path) -> None:
+def test_coverage_without_gap_reports(told: Path) -> None:
     """A topic of which nothing is known is not known; a time that is none is bad usage."""
     assert '100 %' in run(told, *TWO_HOURS, '--robot', 'thor', '--topic', '/scan').stdout
     assert 'Nothing is known' in run(told, *TWO_HOURS, '--robot', 'tachi').stdout

@@ -134,7 +134,7 @@ def test_nothing_to_verify_is_no_success(home: Path) -> None:
     assert 'Nothing is verified' in answer.stdout
 
 
-def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_resumes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With what was not asked yet and what was wrong, also after a kill that cut off its notes; a run that ended starts anew."""
     file(home, KEYS[0]).unlink()
     answered: list[Any] = []

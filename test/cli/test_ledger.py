@@ -97,7 +97,7 @@ def test_robots_that_share_a_spool_are_all_named(tmp_path: Path, monkeypatch: py
     abandon(spool)
 
 
-def test_a_pipe_gets_every_column_whole() -> None:
+def test_a_pipe_gets_complete_columns() -> None:
     """What is wider than 80 columns is not wrapped where no terminal asks for it: one line a topic."""
     losses = {'rejected': {'truncated': 1_000_000}, 'dropped': {'queue_full': 2_000_000}}
     name = 'tachi__front_camera__image_raw__compressed'
@@ -116,7 +116,7 @@ def test_a_narrow_terminal_breaks_no_topic(width: int) -> None:
     assert '/tachi/front_camera/image_raw/compressed' in text.split()
 
 
-def test_columns_without_figures_are_left_out() -> None:
+def test_empty_columns_are_hidden() -> None:
     """Rejected, dropped and open appear only where there is something in them."""
     assert not {'rejected', 'dropped', 'open'} & set(shown(a_ledger(imu=a_topic())).split())
     assert 'dropped' in shown(a_ledger(imu=a_topic(dropped={'queue_full': 1}))).split()
@@ -138,7 +138,7 @@ def test_causes_are_listed_by_topic() -> None:
     assert '/odom:' not in text
 
 
-def test_other_types_of_a_topic_are_told() -> None:
+def test_other_types_of_a_topic_are_reported() -> None:
     """By whom, and how many messages were refused, or that nobody knows."""
     others = {'a/msg/A': {'publishers': ['/x'], 'messages': 1234}, 'b/msg/B': {'publishers': [], 'messages': None}}
     text = shown(a_ledger(odom=a_topic(other_types=others)), 200)
@@ -146,7 +146,7 @@ def test_other_types_of_a_topic_are_told() -> None:
     assert 'published as b/msg/B too, by a program that is not a ROS node; it was not listened to' in text
 
 
-def test_messages_that_were_dated_by_their_arrival_are_told() -> None:
+def test_messages_dated_by_arrival_are_reported() -> None:
     """How many of which topic, by the reason why their own time was not trusted."""
     text = shown(a_ledger(odom=a_topic(by_arrival={'sent_ahead': 3, 'stamp_too_old': 1200})), 200)
     assert '/odom: dated by arrival, not by the message: stamp_too_old 1,200, sent_ahead 3' in text
@@ -160,7 +160,7 @@ def test_a_clock_that_is_off_is_named() -> None:
     assert 'the clock of the computer that publishes it is not synchronized' in text
 
 
-def test_what_is_not_delivered_is_said() -> None:
+def test_undelivered_messages_are_reported() -> None:
     """Stored messages whose objects are elsewhere than in the store are named with where they are."""
     text = shown(a_ledger(imu=a_topic(stored_in=dict.fromkeys(STATES, 0) | {'delivered': 50, 'pending': 10})))
     assert '/imu: of 60 stored, pending 10' in text
@@ -181,7 +181,7 @@ ABOUT: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_an_estimate_is_marked_wherever_it_stands() -> None:
+def test_estimates_are_marked_everywhere() -> None:
     """In the row of the topic, in the total, and with its causes."""
     text = shown(a_ledger(imu=a_topic(**ABOUT), odom=a_topic()))
     assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:5] == ['estimated', '~123', '100', '~23']
@@ -294,7 +294,7 @@ def test_no_spool_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
         ({'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 0}, []),
     ],
 )
-def test_what_the_clock_did_is_said(clock: dict[str, Any], words: list[str]) -> None:
+def test_clock_steps_are_reported(clock: dict[str, Any], words: list[str]) -> None:
     """Only where somebody who reads dates should know."""
     text = ' '.join(shown({**a_ledger(), 'clock': clock}).split())
     for part in words:
@@ -324,7 +324,7 @@ def gaps(root: Path, *options: str) -> tuple[Any, list[dict[str, Any]]]:
     return text, json.loads(as_json.stdout)['gaps'] if as_json.exit_code == 0 else []
 
 
-def test_gaps_say_when_how_long_how_many_and_why(tmp_path: Path) -> None:
+def test_gaps_have_time_duration_count_and_cause(tmp_path: Path) -> None:
     """As a table, and as the JSON of the contract."""
     lossy(tmp_path / 'spool')
     text, rows = gaps(tmp_path / 'spool')
@@ -365,7 +365,7 @@ def test_gaps_say_when_how_long_how_many_and_why(tmp_path: Path) -> None:
         (['--cause', 'missed'], ['transport']),
     ],
 )
-def test_gaps_can_be_asked_for_by_topic_time_and_cause(tmp_path: Path, options: list[str], causes: list[str]) -> None:
+def test_gaps_can_be_filtered_by_topic_time_and_cause(tmp_path: Path, options: list[str], causes: list[str]) -> None:
     """What has no time is left out once one is asked for."""
     lossy(tmp_path / 'spool')
     _, rows = gaps(tmp_path / 'spool', *options)

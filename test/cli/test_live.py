@@ -33,7 +33,7 @@ def test_a_relayed_robot_is_on_another_machine(tmp_path: Path) -> None:
             check_urls(folder, url, rtsp, '', None)
 
 
-def test_whose_page_it_is_follows_from_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_kind_of_page_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A store's where no node has run, unless something says that this is a robot; a robot's as soon as one has."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     for name in ('AWS_ENDPOINT_URL', 'SHADOWHOUND_ROBOT'):

@@ -186,7 +186,7 @@ def test_every_class_of_errors_has_a_remedy(monkeypatch: pytest.MonkeyPatch, cap
             assert command in VERBS or command.split()[0] in VERBS, remedy
 
 
-def test_a_remedy_of_its_own_comes_first() -> None:
+def test_a_specific_remedy_takes_precedence() -> None:
     """That of its class is for those without."""
     error = BagError('no bag x', remedy='look again')
     assert described(error, ['bag', 'info', 'x']) == (f'{PROGRAM} bag info', 'no bag x', 'look again')
@@ -214,7 +214,7 @@ def test_a_remedy_of_its_own_comes_first() -> None:
     (['query', '--since', 'soon'], ExitCode.USAGE, "since = 'soon' is refused", 'allowed is now'),
     (['query', 'SELEKT 1'], ExitCode.USAGE, 'SELEKT', ''),
 ])  # fmt: skip
-def test_an_error_says_what_and_what_to_do(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+def test_an_error_has_a_message_and_a_remedy(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
                                            arguments: list[str], code: ExitCode, what: str, remedy: str) -> None:  # fmt: skip
     """As somebody makes them: the verb and what is wrong, then what to do; wrong usage is 2, the rest 1."""
     assert home.is_dir()
@@ -308,7 +308,7 @@ def test_output_that_the_terminal_cannot_hold_is_escaped(encoding: str) -> None:
 
 
 @pytest.mark.parametrize('lines', [1, 100_000])
-def test_a_reader_that_goes_away_is_no_error(lines: int) -> None:
+def test_a_closed_pipe_is_not_an_error(lines: int) -> None:
     """``| head`` has enough: not a word on standard error, whether the rest was written meanwhile or is still in a buffer."""
     with subprocess.Popen(printing(lines), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -368,7 +368,7 @@ def test_verbs_are_about_the_robot_of_this_machine(spool: Path, capsys: pytest.C
         cli(['bag', 'list'], standalone_mode=False)
 
 
-def test_nothing_says_which_robot(spool: Path) -> None:
+def test_an_ambiguous_robot(spool: Path) -> None:
     """Not even the store: it is the node's default, unless something must exist."""
     assert the_robot(None, in_store=True) == 'thor'
     with pytest.raises(BadUsage, match='none'):

@@ -56,7 +56,7 @@ def deliver(home: Path, mission_id: str) -> None:
         delivery.spool()
 
 
-def test_without_a_mission_it_says_where_it_looked(tmp_path: Path) -> None:
+def test_without_a_mission_the_searched_folder_is_named(tmp_path: Path) -> None:
     """That is fine, and no error."""
     found = run(tmp_path, 'list')
     assert found.return_value == 0
@@ -64,7 +64,7 @@ def test_without_a_mission_it_says_where_it_looked(tmp_path: Path) -> None:
     assert json.loads(run(tmp_path, 'list', '--json').output) == []
 
 
-def test_the_list_tells_what_is_not_sent(tmp_path: Path) -> None:
+def test_the_list_shows_unsent_records(tmp_path: Path) -> None:
     """A mission that is over and not sent is a finding; one that is sent, or active, is none."""
     mission_id = fly(tmp_path)
     found = run(tmp_path, 'list')
@@ -80,7 +80,7 @@ def test_the_list_tells_what_is_not_sent(tmp_path: Path) -> None:
         assert [each['result'] for each in json.loads(found.output)] == ['FINISHED', 'active']
 
 
-def test_what_somebody_sends_already_needs_no_resume(tmp_path: Path) -> None:
+def test_a_mission_being_sent_needs_no_resume(tmp_path: Path) -> None:
     """While an agent's sender is at it the list says so, and asks for nothing."""
     fly(tmp_path)
     with flock(tmp_path / MISSIONS / LOCK):
@@ -114,7 +114,7 @@ def test_either_id_finds_a_mission(tmp_path: Path, which: str) -> None:
 
 
 @pytest.mark.parametrize('wanted', ['nobody', '', 'p'])
-def test_an_id_that_finds_none_or_several_is_bad_usage(
+def test_an_unknown_or_ambiguous_id_is_a_usage_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], wanted: str
 ) -> None:
     """Exit code 2."""
@@ -128,7 +128,7 @@ def test_an_id_that_finds_none_or_several_is_bad_usage(
     assert 'mission' in capsys.readouterr().err
 
 
-def test_a_page_tells_why_something_is_not_sent(tmp_path: Path) -> None:
+def test_a_page_shows_why_a_record_is_unsent(tmp_path: Path) -> None:
     """Parameters, last values, counts, and the last error with its remedy."""
     mission_id = fly(tmp_path)
     see(tmp_path, mission_id)

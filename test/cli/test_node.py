@@ -72,7 +72,7 @@ def run(*arguments: str) -> Result:
     ],
     ids=' '.join,
 )  # fmt: skip
-def test_a_verb_asks_for_what_it_says(serving: Serving, words: list[str], request_: dict[str, Any]) -> None:
+def test_each_verb_sends_its_command(serving: Serving, words: list[str], request_: dict[str, Any]) -> None:
     """Its words are what the node answers; a value is read as ``ros2 param set`` reads it."""
     result = run(*words)
     assert (result.return_value, result.stdout) == (0, f'{request_["do"]} is done\n'), result.output

@@ -102,7 +102,7 @@ def test_every_variable_of_the_guide_is_on_it() -> None:
     assert {name for name in told if f'| `{name}` |' not in parameters()} == {'ROS_DISTRO'} & told
 
 
-def test_every_table_is_whole() -> None:
+def test_every_table_is_complete() -> None:
     """The rows of a table have as many cells as its head."""
     for table in re.findall(r'(?:^\|.*\n)+', parameters() + commands(), re.MULTILINE):
         assert len({len(re.findall(r'(?<!\\)\|', row)) for row in table.splitlines()}) == 1, table

@@ -93,7 +93,7 @@ def test_keys_with_a_passphrase(team: Team) -> None:
     team.run('refresh')
 
 
-def test_a_team_whose_root_needs_two(team: Team) -> None:
+def test_a_root_with_a_threshold_of_two(team: Team) -> None:
     """Nothing is signed before two of three have; one alone rotates nothing; a robot follows from the first root to the last."""
     people = {name: team.home / 'people' / f'{name}.key' for name in ('alice', 'bob', 'carol')}
     for name in people:
@@ -174,7 +174,7 @@ def test_new_keys_from_where_only_the_root_is(team: Team) -> None:
     assert 'no longer listed: go2/go2_patrol/3' in said
 
 
-def test_two_rotations_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_concurrent_rotations(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only one of two roots of the same number is in force; who was late keeps none of its keys."""
     team.run('keys')
     team.publish('go2/go2_patrol/1')
@@ -243,7 +243,7 @@ def test_a_version_is_withdrawn(team: Team) -> None:
     assert 'does not list' in team.run('withdraw', 'go2_patrol@7', code=1)
 
 
-def test_two_who_sign_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_concurrent_signers(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second one gets an error and repeats it: neither change is lost."""
     team.run('keys')
     team.publish('go2/go2_patrol/1')
@@ -263,7 +263,7 @@ def test_two_who_sign_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> No
     assert one.listed() == [f'go2/go2_patrol/{number}' for number in (1, 2, 3)]
 
 
-def test_a_robot_that_received_nothing_fresh_says_so(team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stale_metadata_is_reported(team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In policy list, policy show, status and the doctor, with both dates; with a fresh timestamp none of them does."""
     team.run('keys')
     robot = team.robot('.')

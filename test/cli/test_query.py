@@ -52,7 +52,7 @@ def test_a_table_is_for_reading(home: Path) -> None:
     )
 
 
-def test_json_and_csv_are_whole(home: Path) -> None:
+def test_json_and_csv_are_complete(home: Path) -> None:
     """Every column of every row, times as ISO in UTC."""
     told = json.loads(run(home, '--sensor', 'odom', '--json').output)
     assert len(told) == 48

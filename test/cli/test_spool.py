@@ -63,7 +63,7 @@ def states(home: Path) -> dict[str, str]:
     return {row['key'].removeprefix('thor/camera/'): row['state'] for row in found}
 
 
-def test_what_lies_here(home: Path) -> None:
+def test_list_shows_the_spool(home: Path) -> None:
     """By sensor and state, and what to do about each; exit code 1 because something was refused."""
     answer = run()
     assert answer.return_value == 1
@@ -141,14 +141,14 @@ def test_one_object_waits_again(home: Path) -> None:
     assert states(home)['d.jpg'] == 'pending'
 
 
-def test_gaps_are_told_again(home: Path) -> None:
+def test_gaps_are_resent(home: Path) -> None:
     """The next part begins anew."""
     assert said('resend-gaps') == {'rows': 1}
     answer = run('resend-gaps')
     assert (answer.return_value, answer.stdout) == (0, '1 row of the gap journal will be sent again with the next part\n')
 
 
-def test_a_file_that_is_gone_does_not_wait(home: Path) -> None:
+def test_a_missing_file_does_not_wait(home: Path) -> None:
     """It is said, and the object stays what it was."""
     (home / 'spool/quarantine/access_denied' / BUCKET / 'thor/camera/d.jpg').unlink()
     answer = run('retry')
@@ -232,7 +232,7 @@ def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch
     assert said('drain')['delivered'] == 3  # the object, its part of the catalog, and that it is not a gap any more
 
 
-def test_a_store_that_is_away_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_store_is_reported(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It gives up after its patience, says why, and everything is still there."""
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
@@ -254,7 +254,7 @@ def test_a_node_delivers_already(home: Path) -> None:
 
 
 @pytest.mark.parametrize(('retries', 'rounds'), [(0, 1000), (1, 0)])
-def test_patience_is_for_what_stands_still(home: Path, monkeypatch: pytest.MonkeyPatch, retries: int, rounds: int) -> None:
+def test_the_timeout_is_for_stalls(home: Path, monkeypatch: pytest.MonkeyPatch, retries: int, rounds: int) -> None:
     """A slice that takes minutes to send is waited for; a store that takes the bytes and refuses each time is not."""
     time = SimpleNamespace(now_s=0.0)
     time.monotonic = lambda: time.now_s

@@ -112,7 +112,7 @@ def test_without_a_message_it_names_the_command_that_finds_out_why() -> None:
     assert 'Fine' not in text
 
 
-def test_it_says_what_is_recorded() -> None:
+def test_status_shows_the_recording() -> None:
     """The bag, how much is in it, and what is wrong with it; nothing while nothing is recorded."""
     bag = {'recording': True, 'paused': False, 'bag': 'patrol_1', 'slice': 3, 'messages': 12_345, 'bytes': 10**7, 'dropped': 0,
            'duration_s': 200.0, 'queue_bytes': 0, 'refused': '', 'topics': {}}  # fmt: skip
@@ -125,7 +125,7 @@ def test_it_says_what_is_recorded() -> None:
     assert '7 messages dropped' in text
 
 
-def test_it_says_what_the_events_do() -> None:
+def test_status_shows_events() -> None:
     """What the ring has and what triggered last; nothing while it is off."""
     events = {'enabled': True, 'seconds': 30.2, 'bytes': 10**7, 'max_bytes': 64 << 20, 'bag': '', 'refused': '', 'triggers': 2,
               'written': 1, 'topics': {},
@@ -139,7 +139,7 @@ def test_it_says_what_the_events_do() -> None:
     assert 'stands still' in line(shown(events={**events, 'bag': 'event_fall_1', 'refused': 'no_room'}), 'events')
 
 
-def test_it_says_which_mission_is_active() -> None:
+def test_status_shows_the_active_mission() -> None:
     """Its type, since when, its id and its run, in 80 columns; nothing where there is none."""
     assert 'mission' not in shown()
     mission = {'mission_id': 'patrol_20261121_063605_1f2e3d4c', 'run_id': None, 'type': 'patrol',
@@ -178,7 +178,7 @@ def test_the_isolation_of_the_active_policy_is_reported(tmp_path: Path, isolatio
     assert any('state.json is damaged' in finding for finding in found['findings'])
 
 
-def test_it_says_when_what_is_asked_for_will_have_arrived() -> None:
+def test_status_estimates_when_requests_finish() -> None:
     """Requests that wait, their bytes, and how long these take; a node that keeps nothing says nothing of it."""
     asked = {'open': 2, 'bytes': 120_000_000, 'mbps': 3.2, 'left_s': 300}
     assert '2 open, for 120.0 MB, which arrive in 5 min' in shown(requests=asked)
@@ -228,7 +228,7 @@ def test_topics_that_were_never_heard_are_one_line() -> None:
     assert line(text, '/d').split()[1] == 'off'
 
 
-def test_trouble_is_told_with_its_remedy() -> None:
+def test_problems_have_remedies() -> None:
     """The store's last error while it is not fine, each worker that fails, and that the node is paused."""
     text = shown(store={'state': 'store_down', 'last_error': 'refused (is it on?)'}, paused=True,
                  findings=('delivery: store down',),
@@ -303,7 +303,7 @@ def test_without_a_node_the_spool_is_shown(tmp_path: Path) -> None:
     assert 'SHADOWHOUND_HOME' in none.stdout
 
 
-def test_whose_node(tmp_path: Path) -> None:
+def test_the_robot_of_the_node(tmp_path: Path) -> None:
     """The one that runs, unless one is asked for by option or environment; others that run are named."""
     write(tmp_path, robot='rex', ended=True)
     write(tmp_path, robot='tachi')
@@ -326,7 +326,7 @@ def test_bad_usage_is_exit_code_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('as_json', [False, True])
-def test_watch_goes_on_until_ctrl_c(tmp_path: Path, as_json: bool) -> None:
+def test_watch_runs_until_ctrl_c(tmp_path: Path, as_json: bool) -> None:
     """Into a pipe: a status each time, with --json one line each; Ctrl-C ends it with exit code 0."""
     write(tmp_path)
     command = [sys.executable, '-u', '-m', 'shadowhound_data_logger.cli.main', 'status', '--watch', '--interval', '0.05']
@@ -354,7 +354,7 @@ def read_heads(process: subprocess.Popen[str], count: int, as_json: bool) -> lis
 
 
 @pytest.mark.long('a process of its own')
-def test_the_live_view_leaves_the_terminal_as_it_was(tmp_path: Path) -> None:
+def test_watch_restores_the_terminal(tmp_path: Path) -> None:
     """On a terminal the screen is switched and given back, and the last view stays; exit code 0."""
     write(tmp_path)
     ours, theirs = os.openpty()

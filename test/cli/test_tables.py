@@ -45,7 +45,7 @@ def test_a_table_that_is_too_wide_is_a_list_of_names_and_values() -> None:
     assert lines.count('') == 1
 
 
-def test_a_file_gets_the_whole_table() -> None:
+def test_a_file_gets_the_complete_table() -> None:
     """However narrow the terminal was."""
     lines = printed(40, is_terminal=False)
     assert [line.split()[0] for line in lines] == ['Gaps', 'topic', TOPIC, '/imu']

@@ -90,7 +90,7 @@ def test_another_store_than_the_node_had(home: Path) -> None:
         assert as_json('--verify')['delivered_to'] == [target]
 
 
-def test_what_the_index_forgot_is_said(home: Path) -> None:
+def test_forgotten_objects_are_reported(home: Path) -> None:
     """The report says how many it cannot ask for."""
     with closing(sqlite3.connect(home / 'spool/index.db')) as index:
         index.execute("DELETE FROM objects WHERE key = 'thor/a'")
@@ -107,7 +107,7 @@ def test_the_catalog_is_not_called_forgotten(home: Path) -> None:
     assert (said['known'], said['forgotten']) == (2, 0)
 
 
-def test_a_store_that_is_away(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_store(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exit code 1, no object is called missing, how far it came, and no secret; then the folder is another store."""
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
@@ -125,7 +125,7 @@ def test_a_store_that_is_away(home: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert as_json('--verify')['asked'] == 3
 
 
-def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_resumes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What an earlier run found sound is not asked for again, unless that is asked for."""
     heads = DirectoryStore.head
 

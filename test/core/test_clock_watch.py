@@ -70,7 +70,7 @@ def test_it_is_not_waited_for_for_ever(clocks: Clocks) -> None:
     assert not watch.state().gave_up
 
 
-def test_a_clock_that_is_lost_is_waited_for_anew(clocks: Clocks) -> None:
+def test_a_lost_clock_is_waited_for_again(clocks: Clocks) -> None:
     """Back in 1970, the wait begins there."""
     clocks.set()
     watch = ClockWatch(clocks, 600.0)
@@ -82,7 +82,7 @@ def test_a_clock_that_is_lost_is_waited_for_anew(clocks: Clocks) -> None:
     assert (state.is_set, state.gave_up, state.unset_s) == (False, False, 599.0)
 
 
-def test_each_change_is_said_once(clocks: Clocks, caplog: pytest.LogCaptureFixture) -> None:
+def test_each_change_is_logged_once(clocks: Clocks, caplog: pytest.LogCaptureFixture) -> None:
     """That it is not set, that nothing waits for it any more, that it was set, and each step."""
     caplog.set_level(logging.INFO)
     watch = ClockWatch(clocks, 600.0, steps=4)

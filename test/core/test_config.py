@@ -78,7 +78,7 @@ def test_a_robot_name_that_is_no_word(value: object) -> None:
     assert refused(robot=value).data['value'] == value
 
 
-def test_a_robot_name_of_the_shell_is_told_as_that() -> None:
+def test_an_invalid_robot_name_names_its_variable() -> None:
     """Who set SHADOWHOUND_ROBOT finds no parameter ``robot`` in the file."""
     with pytest.raises(SettingError, match="SHADOWHOUND_ROBOT = 'Thor 1' is refused; allowed is a name: use letters"):
         load({'SHADOWHOUND_ROBOT': 'Thor 1'})
@@ -121,7 +121,7 @@ def test_an_unknown_parameter_stops_the_start(name: str, near: str) -> None:
 
 
 @pytest.mark.parametrize('name', ['robot', 'spool', 'a/b', '', 'use_sim_time'])
-def test_a_sensor_needs_a_name_of_its_own(name: str) -> None:
+def test_sensor_names_are_unique(name: str) -> None:
     """A sensor that would be mistaken for another parameter or a folder is refused."""
     assert refused(sensors=[name]).data['name'] == 'sensors'
 

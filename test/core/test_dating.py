@@ -35,7 +35,7 @@ def test_it_waits_while_the_clock_is_not_set(clocks: Clocks, dating: Dating) -> 
     assert dating.offset_ns('this-boot', clocks.boot_ns()) is None, 'what begins later waits as long'
 
 
-def test_the_clock_as_it_is_dates_what_this_boot_left(clocks: Clocks, dating: Dating) -> None:
+def test_the_current_clock_dates_objects_of_this_boot(clocks: Clocks, dating: Dating) -> None:
     """Whatever was noted of it, and however long it has waited; a correction counts from then on."""
     began_ns = clocks.boot_ns()
     clocks.wait(2 * HOLD_S)

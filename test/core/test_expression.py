@@ -53,7 +53,7 @@ def test_each_comparison(sign: str, holding: set[int]) -> None:
     'x: t:f < 20 for', 'x: t:f < 20 for -1', 'x: t:f < 20 for 1e6', 'x: t:f < 1e999', 'x: t:f < nan', '../x: t:f < 20',
     f'{"x" * 65}: t:f < 1', 'x: t:3 < 1',
 ])  # fmt: skip
-def test_what_is_none_stops_the_start(text: str) -> None:
+def test_an_invalid_expression_aborts_startup(text: str) -> None:
     """With the parameter's name, its value and what is allowed."""
     with pytest.raises(SettingError) as refused:
         Settings.load({'events.topics': ['t'], 'events.conditions': [text]}, {})

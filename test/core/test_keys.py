@@ -71,7 +71,7 @@ def test_a_numbered_key_is_allowed(key: str, attempt: int) -> None:
     ('x/' + 'y' * 196 + '.jpg', 'x/' + 'y' * 194 + '_2.jpg'), ('.' + 'x' * 199, '.' + 'x' * 197 + '_2'),
     ('/'.join([*['y' * 170] * 5, 'y' * 169]), '/'.join([*['y' * 170] * 5, 'y' * 167 + '_2'])),
 ])  # fmt: skip
-def test_the_number_stands_before_the_extension(key: str, second: str) -> None:
+def test_the_number_is_before_the_extension(key: str, second: str) -> None:
     """The number follows the stem; a name at the limit of its length loses the end of its stem."""
     assert check_key(unique(check_key(key), 2)) == second
 

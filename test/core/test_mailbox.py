@@ -28,7 +28,7 @@ ANYTHING = st.recursive(
 @given(st.dictionaries(st.sampled_from([*GOOD, 'cancel']), ANYTHING, max_size=2), st.none() | st.dictionaries(
     st.sampled_from(['sensor', 'topic', 'mission', 'mission_type', 'since_ns', 'until_ns', 'near', 'keys']), ANYTHING, max_size=3,
 ))  # fmt: skip
-def test_an_entry_is_refused_or_says_the_same_again(changed: dict[str, Any], want: dict[str, Any] | None) -> None:
+def test_an_entry_is_rejected_or_round_trips(changed: dict[str, Any], want: dict[str, Any] | None) -> None:
     """With surrogates, NaN, huge numbers and nests in any place, an id that is the hash of them or not."""
     entry = {**GOOD, **changed}
     if want is not None:

@@ -64,7 +64,7 @@ def test_an_answer_that_breaks_off(tmp_path: Path, status: int, broken: bytes) -
 
 
 @pytest.mark.parametrize('body', [b'[' * 200_000, b'[]', b'\xff', b'{"error_code": 5}'])
-def test_an_error_that_is_none_of_mlflow(tmp_path: Path, body: bytes) -> None:
+def test_an_error_that_is_not_mlflows(tmp_path: Path, body: bytes) -> None:
     """Is one of ours, whatever its body is."""
     with answering(400, body) as (url, _), pytest.raises(TrackingRefused) as refused:
         MlflowRest(url, LOGIN, tmp_path).json('GET', 'runs/get')

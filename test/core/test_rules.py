@@ -45,7 +45,7 @@ def evaluate(text: str, known: Known, now_s: float = 0.0) -> RuleResult:
     return read(text).evaluate(known, now_s)
 
 
-def test_an_empty_rule_is_none() -> None:
+def test_an_empty_rule_is_no_rule() -> None:
     assert read_rule('', 'upload.when') is None
     assert read_rule('  ', 'upload.when') is None
 
@@ -60,7 +60,7 @@ def test_an_empty_rule_is_none() -> None:
     ('mission and (wifi.ssid == "home" or dock/at:data == 0)', False), ('not (mission and wifi.ssid == "home")', True),
     ('lowstate:bms_state.soc > 30 for 0 s', True), ('lowstate:bms_state.soc>30 for 0s and(mission)', True),
 ])  # fmt: skip
-def test_what_rules_say(text: str, holds: bool) -> None:
+def test_rules_and_their_results(text: str, holds: bool) -> None:
     known = Known({'lowstate:bms_state.soc': 42.0, 'dock/at:data': 1.0}, ['lab'], 12 * 60, 'patrol')
     assert evaluate(text, known).holds is holds
 
@@ -117,7 +117,7 @@ def test_topics_are_those_that_it_asks() -> None:
     ('wifi.ssid > "lab"', 'character 11'), ('wifi.ssid == lab', 'character 14'), ('time 22-6', 'character 6'),
     ('mission & x', 'character 9'), ('not', 'character 4'),
 ])  # fmt: skip
-def test_a_bad_rule_is_told_where(text: str, place: str) -> None:
+def test_an_invalid_rule_names_the_position(text: str, place: str) -> None:
     with pytest.raises(SettingError) as caught:
         read_rule(text, 'upload.when')
     assert place in str(caught.value)

@@ -145,7 +145,7 @@ def test_messages_that_a_queue_held_up_keep_their_stamps() -> None:
 
 
 @pytest.mark.parametrize('usual_ns', [5 * MS, 146 * SECOND])
-def test_messages_of_a_queue_that_empties_at_once_keep_their_stamps(usual_ns: int) -> None:
+def test_messages_of_a_draining_queue_keep_their_stamps(usual_ns: int) -> None:
     """Four seconds without any, then all of them within milliseconds, twice; after that the usual offset is known again."""
     track = new_track()
     follow(track, [usual_ns] * 60)

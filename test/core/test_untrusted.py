@@ -17,8 +17,8 @@ from shadowhound_data_logger.missions.pictures import read_path
 NOON_NS = 1_793_188_800_000_000_000
 READERS: dict[str, tuple[str, Callable[[Path], Any], Any]] = {
     'trajectory': ('timestamp,x,y,yaw\n1,0,0,0\n2,1,0,0\n', read_path, [(1.0, 0.0, 0.0), (2.0, 1.0, 0.0)]),
-    '--times': (f'episode,begin_ns\n0,{NOON_NS}\n', imports.times_of, {0: NOON_NS}),
-    '--clock': (f'robot_ns,arm_ns\n{NOON_NS},{NOON_NS + 1}\n', lambda path: clocks.pairs_of(path).tolist(),
+    '--times': (f'episode,begin_ns\n0,{NOON_NS}\n', imports.read_times, {0: NOON_NS}),
+    '--clock': (f'robot_ns,arm_ns\n{NOON_NS},{NOON_NS + 1}\n', lambda path: clocks.read_pairs(path).tolist(),
                 [[NOON_NS, NOON_NS + 1]]),
     'labels': ('label,since,until\nTür,2026-11-20T12:30,2026-11-20T12:31\n',
                lambda path: [(one.label, one.until_ns - one.since_ns) for one in from_csv(path.read_bytes(), 'thor', 0)],

@@ -63,7 +63,7 @@ def test_a_system_that_keeps_no_names(tmp_path: Path, monkeypatch: pytest.Monkey
     assert worker.failures == 0
 
 
-def test_a_failure_is_counted_said_and_survived(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_is_counted_and_logged(caplog: pytest.LogCaptureFixture) -> None:
     """A round that raises shows in the log and in the status, and the next one begins after a pause."""
     caplog.set_level(logging.INFO)
     rounds: list[int] = []
@@ -104,7 +104,7 @@ def test_a_stop_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     assert worker.failing
 
 
-def test_a_round_that_hangs_is_told() -> None:
+def test_a_hanging_round_is_reported() -> None:
     """Join says that it did not end in time; one that never started has nothing to wait for."""
     began, released = threading.Event(), threading.Event()
 
@@ -197,7 +197,7 @@ def test_looking_at_one_that_is_not_wanted_starts_nothing() -> None:
     assert (worker.alive, worker.failures) == (False, 0)
 
 
-def test_how_long_a_round_lasts_is_told() -> None:
+def test_the_duration_of_a_round_is_reported() -> None:
     """A round that hangs grows old in the status; one that ends does not."""
     released = threading.Event()
 
@@ -214,7 +214,7 @@ def test_how_long_a_round_lasts_is_told() -> None:
     assert worker.status().busy_s == 0.0
 
 
-def test_workers_that_share_what_was_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_workers_share_reported_failures(caplog: pytest.LogCaptureFixture) -> None:
     """A defect that many of them meet, again and again, is one entry in the log, with its traceback."""
     reported: set[str] = set()
     workers = [Worker(f'w-{number}', lambda: _raise(ValueError('x')), reported=reported) for number in range(3)]

@@ -102,7 +102,7 @@ def test_the_offset_is_what_it_was(exported: Exported) -> None:
         assert np.abs(away).max() <= clock.uncertainty_ns < SECOND // 1000
 
 
-def test_an_episode_whose_offset_nobody_knows_is_refused(exported: Exported) -> None:
+def test_an_episode_with_an_unknown_offset_is_rejected(exported: Exported) -> None:
     """With the reason."""
     assert exported.refused == {LAST: "the offset of the arm's clock is unknown: no event was timed by both machines"}
     assert exported.waiting == {}

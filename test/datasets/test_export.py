@@ -101,7 +101,7 @@ def test_no_value_of_a_tick_comes_from_its_future(house: House, exported: Export
     assert state.shape == (len(stamps), 7 + 10 + 12)
 
 
-def test_a_gap_is_flagged_at_its_ticks_and_nowhere_else(exported: Exported) -> None:
+def test_a_gap_is_flagged_exactly_at_its_ticks(exported: Exported) -> None:
     """With the cause that the journal states, or as not published where it knows of none."""
     made = Lerobot(exported.folder)
     mission = Mission('gappy', begin_s=100, seconds=4)
@@ -186,7 +186,7 @@ def test_a_mission_with_too_large_gaps_is_refused(house: House, tmp_path: Path) 
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_it_waits_until_the_robot_has_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_waits_for_the_robots_gap_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And takes the mission then; after some time in which nothing was heard it gives up, and says for what it waited."""
     place = House(tmp_path)
     mission = place.record(Mission('late', seconds=2, sensors=('camera', 'odom'), told_until_s=-3))
@@ -206,7 +206,7 @@ def test_it_waits_until_the_robot_has_told(tmp_path: Path, monkeypatch: pytest.M
     assert sum(looked[3:]) == 20
 
 
-def test_what_the_robot_cannot_tell_is_not_waited_for(tmp_path: Path) -> None:
+def test_it_does_not_wait_for_gaps_that_cannot_be_reported(tmp_path: Path) -> None:
     """A topic of which it counts only what came has no watermark, ever: the mission is refused, with the reason."""
     place = House(tmp_path)
     place.record(Mission('blind', seconds=2, sensors=('camera', 'odom'), uncounted=('odom',)))
@@ -457,7 +457,7 @@ def test_the_picture_has_stale_ticks_in_red(exported: Exported) -> None:
     assert 0 < sum(found) < len(found)
 
 
-def test_a_number_that_is_none_is_never_in_a_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nan_is_never_in_a_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message with NaN counts as none: the value before it is held, grows old and becomes stale."""
     place = House(tmp_path)
     mission = Mission('odd', seconds=2, sensors=('camera', 'odom'))
@@ -595,7 +595,7 @@ def test_single_frames_of_a_video_are_those_of_all(tmp_path: Path, codec: str) -
         list(frames_at(path, 10, [3, 21]))
 
 
-def test_a_machine_without_ray_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_ray_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before the store is read."""
     monkeypatch.setitem(sys.modules, 'ray', None)
     with pytest.raises(BadUsage) as refused:
@@ -604,7 +604,7 @@ def test_a_machine_without_ray_says_what_to_install(monkeypatch: pytest.MonkeyPa
     assert "pip install 'daft[ray]'" in refused.value.remedy
 
 
-def test_an_address_where_nothing_answers_is_told_at_once(tmp_path: Path) -> None:
+def test_an_unreachable_address_is_reported_immediately(tmp_path: Path) -> None:
     """Also where there is no ray to try it with."""
     job: Any = (None, None, 0, None, tmp_path)
     with closing(socket.socket()) as taken:

@@ -371,7 +371,7 @@ def test_what_others_left_in_the_store_is_not_taken_for_an_import(shelf: Shelf) 
 
 
 @pytest.mark.parametrize('column', ['episode_index', 'frame_index'])
-def test_numbers_of_frames_that_are_none(shelf: Shelf, column: str) -> None:
+def test_invalid_frame_numbers(shelf: Shelf, column: str) -> None:
     folder = shelf.set()
     path = folder / 'data/chunk-000/file-000.parquet'
     table = pq.read_table(path)

@@ -74,7 +74,7 @@ def dying(patch: pytest.MonkeyPatch, at: int) -> None:
     patch.setattr(os, 'replace', replace)
 
 
-def test_an_export_that_was_killed_goes_on(house: House, tmp_path: Path) -> None:
+def test_a_killed_export_resumes(house: House, tmp_path: Path) -> None:
     """At every file that it writes: of an episode, of the dataset, the last one."""
     export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
     wanted = contents(tmp_path / 'whole')
@@ -106,7 +106,7 @@ def test_a_process_that_was_killed_is_followed_by_another(house: House, tmp_path
         assert contents(folder) == wanted, at
 
 
-def test_a_worker_that_was_killed_is_told(house: House, tmp_path: Path) -> None:
+def test_a_killed_worker_is_reported(house: House, tmp_path: Path) -> None:
     """Nothing was added then; the next run gives the same files."""
     export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
     with pytest.MonkeyPatch.context() as patch:

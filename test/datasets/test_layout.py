@@ -167,7 +167,7 @@ def test_what_cannot_be_joined_is_refused(house: House, tmp_path: Path, plain: L
 
 @pytest.mark.long('an export for each file that it writes')
 @pytest.mark.parametrize('layout', [SHARED, 'episode'])
-def test_a_set_that_was_killed_while_it_grew_goes_on(house: House, tmp_path: Path, layout: str) -> None:
+def test_a_killed_append_resumes(house: House, tmp_path: Path, layout: str) -> None:
     """At each file that adding an episode writes; and what was in the set before can be read in between."""
     exported(house, tmp_path / 'whole', 'm0', 'm1', layout=layout)
     wanted = contents(tmp_path / 'whole')

@@ -71,7 +71,7 @@ def test_what_each_recorded_is_there_at_its_own_rate(task: tuple[Path, Exported]
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_the_frames_are_told_in_a_table(task: tuple[Path, Exported]) -> None:
+def test_frames_are_listed_in_a_table(task: tuple[Path, Exported]) -> None:
     """A row each, with the messages that it was made of, by their own clocks, and the offset."""
     folder, found = task
     rows = rows_of(folder / 'synchronized/timestamps.csv')
@@ -111,7 +111,7 @@ def test_detections_are_handed_on_and_a_mission_is_taken_out(house: House, tmp_p
     assert np.all([path.name != 'fetch1' for path in task.rglob('*')])
 
 
-def test_a_mission_leads_nowhere_else(tmp_path: Path) -> None:
+def test_a_mission_id_stays_in_its_folder(tmp_path: Path) -> None:
     """Its id comes from a store: one that is a way out of the folder is refused, and nothing is removed."""
     kept = tmp_path / 'kept'
     kept.mkdir()

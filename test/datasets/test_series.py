@@ -159,7 +159,7 @@ def test_a_mission_without_a_bag_next_to_one_with(yard: Yard) -> None:
     assert all('/camera/' in key for key in yard.sources('two'))
 
 
-def test_an_excerpt_does_not_stand_for_a_mission(yard: Yard) -> None:
+def test_an_excerpt_does_not_represent_a_mission(yard: Yard) -> None:
     """An event's bag, and a part of the mission's own one that was requested, have more pictures of less of it."""
     yard.mission('one', 20, 6)
     yard.mission('two', 60, 6)

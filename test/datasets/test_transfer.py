@@ -55,7 +55,7 @@ def die(what: str, at: int, folder: Path, url: str, environ: dict[str, str]) -> 
     return subprocess.run(arguments, env={**os.environ, **environ}, check=False, timeout=120).returncode
 
 
-def test_a_data_set_is_whole_or_not_there(tmp_path: Path, seaweed: Tower) -> None:
+def test_a_dataset_is_complete_or_missing(tmp_path: Path, seaweed: Tower) -> None:
     """Killed at the first file, in the middle and before ``info.json``; then only what is missing is moved."""
     house = House(tmp_path)
     house.record(Mission('only', seconds=2, sensors=('camera', 'odom')))

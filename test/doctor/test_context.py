@@ -55,7 +55,7 @@ def test_the_rest_is_by_ros(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> No
     assert guessed(scene) is Role.WORKSTATION
 
 
-def test_what_is_refused_is_told_and_left_out(scene: Scene) -> None:
+def test_invalid_settings_are_reported_and_dropped(scene: Scene) -> None:
     """One after the other, until the rest is taken."""
     scene.environ |= {'AWS_ENDPOINT_URL': 'tower:9000', 'SHADOWHOUND_ROBOT': '../thor'}
     scene.parameters = {'camera.rate': 1.0, 'imu.batch_s': -1.0, 'odom.rate_hz': 2.0}

@@ -29,7 +29,7 @@ def raced(server: FakeS3) -> Iterator[Result]:
 
 
 @pytest.mark.parametrize(('winners', 'severity'), [(1, Severity.OK), (2, Severity.WARNING)])
-def test_a_server_that_lets_two_win_is_told(winners: int, severity: Severity) -> None:
+def test_a_server_with_two_winners_is_reported(winners: int, severity: Severity) -> None:
     """How many won is in it, and nothing is left in the store."""
     server = FakeS3()
     if winners > 1:

@@ -336,7 +336,7 @@ def test_a_robot_with_cyclone_dds_is_judged_by_how_it_is_heard(robot: Scene) -> 
     [('jazzy', []), ('lyrical', ['the package is made for it too, but tested are humble, jazzy, kilted']),
      ('foxy', ['tested are humble, jazzy, kilted'])],
 )  # fmt: skip
-def test_a_distribution_without_tests_is_told(robot: Scene, distro: str, told: list[str]) -> None:
+def test_an_untested_distribution_is_reported(robot: Scene, distro: str, told: list[str]) -> None:
     """As no finding, and Lyrical otherwise than one that nobody thought of."""
     robot.environ['ROS_DISTRO'] = distro
     results = robot.ask('versions')

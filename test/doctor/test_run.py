@@ -30,7 +30,7 @@ def run(scene: Scene, *wanted: Check, timeout_s: float = 60.0) -> list[Result]:
     return Examination(wanted, scene.context(), timeout_s=timeout_s).run()
 
 
-def test_a_crash_is_a_finding_and_stops_nobody(scene: Scene) -> None:
+def test_a_crash_is_a_finding_and_stops_no_other_check(scene: Scene) -> None:
     """What the check said before, and what the others say, is there as well."""
     found = run(scene, Check(name='crashing', run=crashing), Check(name='fine', run=fine))
     assert [result.check for result in found] == ['crashing.one', 'crashing.crash', 'fine.one']
@@ -57,7 +57,7 @@ def test_a_check_that_hangs_is_a_finding_in_time(scene: Scene) -> None:
     assert '--only hangs' in found[1].remedy
 
 
-def test_a_deadline_of_its_own(scene: Scene) -> None:
+def test_a_check_with_its_own_deadline(scene: Scene) -> None:
     """A check that hangs leaves the rest of the time to what comes after it."""
     over = threading.Event()
     hangs = Check(name='hangs', run=lambda _: iter([ok('hangs.one', str(over.wait(120.0)))]), deadline_s=LIMIT_S)

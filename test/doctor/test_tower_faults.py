@@ -123,7 +123,7 @@ def test_a_seaweedfs_without_keys_is_named(robot: Scene, tmp_path: Path) -> None
         assert ports['filer'] + 10_000 in found_again.data['ports']
 
 
-def test_ports_of_something_else_are_no_finding(robot: Scene) -> None:
+def test_ports_of_other_programs_are_not_a_finding(robot: Scene) -> None:
     """One that hangs, one that speaks plain HTTP and none at all: a robot waits for none of them."""
     began = time.monotonic()
     with hung() as mute, served(FakeS3()) as other, refused() as nothing:
@@ -259,7 +259,7 @@ def test_a_server_that_verifies_nothing(robot: Scene) -> None:
     assert {result.check for result in robot.findings('s3')} == {'s3.checksum', 's3.open'}
 
 
-def test_minio_is_told_and_no_finding(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_minio_is_mentioned_without_a_finding(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Such Towers go on working; what it means that nobody maintains it is said."""
     monkeypatch.setattr('stores.fake_s3.Handler.version_string', lambda _: 'MinIO')
     imitated()(robot)
@@ -299,7 +299,7 @@ class _Open(BaseHTTPRequestHandler):
         pass
 
 
-def test_an_mlflow_that_asks_nobody(robot: Scene) -> None:
+def test_an_mlflow_without_authentication(robot: Scene) -> None:
     """An open server is named, with what that means."""
     server = ThreadingHTTPServer(('127.0.0.1', 0), _Open)
     serving = threading.Thread(target=server.serve_forever)

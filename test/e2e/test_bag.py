@@ -22,7 +22,7 @@ SOON_NS = 30 * 10**9
 pytestmark = pytest.mark.timeout(300 + 2 * DURATION_S)
 
 
-def test_the_bag_is_whole_to_every_reader(session: Session) -> None:
+def test_the_bag_is_complete_in_every_reader(session: Session) -> None:
     """mcap, rosbags, metadata.yaml and manifest.json agree on what is in it, and that nothing is missing."""
     assert session.bag.manifest['state'] == 'complete'
     assert session.bag.manifest['missing'] == []

@@ -125,7 +125,7 @@ def spans(source: Bucket, robot: str, topic: str) -> list[tuple[int, int]]:
 
 
 @pytest.mark.timeout(300 + 2 * DURATION_S)
-def test_what_was_lost_is_told_to_the_store_and_how_far_that_is_all(session: Session, seaweed: Tower) -> None:
+def test_gaps_and_watermarks_reach_the_store(session: Session, seaweed: Tower) -> None:
     """The journal in the store adds up to the ledger; a node that ended by itself leaves nothing open of what it heard."""
     source = Bucket(seaweed.store_settings(), schema.BUCKET)
     judge_gaps(source, session.robot, session.ledger)
@@ -140,7 +140,7 @@ def test_what_was_lost_is_told_to_the_store_and_how_far_that_is_all(session: Ses
 
 
 @pytest.mark.long('a kill')
-def test_a_node_that_is_killed_leaves_nothing_out(processes: Processes, seaweed: Tower, store: S3Store) -> None:
+def test_a_killed_node_reports_all_gaps(processes: Processes, seaweed: Tower, store: S3Store) -> None:
     """In the middle of a mission, once a part is there, and started again: each object has one row, with its mission."""
     node = processes.node(seaweed.environment(), FAST)
     robot = processes.sim(f'seed:={SEED}', 'image_raw:=false')

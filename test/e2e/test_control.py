@@ -127,7 +127,7 @@ def test_a_sensor_that_is_off_in_the_file_is_switched_on(operated: Operated) -> 
     assert operated.numbers('dormant') == list(range(COUNT))
 
 
-def test_another_rate_is_in_force_at_once(operated: Operated) -> None:
+def test_a_changed_rate_applies_immediately(operated: Operated) -> None:
     """A message in a thousand seconds becomes every message; the number may be given without a fraction."""
     operated.publisher.matched('/sampled')
     operated.publish('sampled', range(COUNT))
@@ -200,7 +200,7 @@ def test_a_parameter_is_judged_alike(operated: Operated, name: str, value: Any) 
     assert by_ros == (value if done else before)
 
 
-def test_diagnostics_tell_each_part(operated: Operated) -> None:
+def test_diagnostics_cover_each_part(operated: Operated) -> None:
     """There is an entry for each topic and stage, with the robot as hardware, while somebody listens."""
     operated.publisher.matched('/told')
     operated.publish('told', range(COUNT))
@@ -216,7 +216,7 @@ def test_diagnostics_tell_each_part(operated: Operated) -> None:
     until(lambda: operated.station.diagnostics()['sensor_logger: /told'].level == stale, 'nobody publishes it any more')
 
 
-def test_the_status_file_tells_what_the_ledger_tells(operated: Operated) -> None:
+def test_the_status_file_matches_the_ledger(operated: Operated) -> None:
     """The command line finds a running node, and after the last object an account of every topic like that of the ledger."""
     node, clock = operated.node, SystemClock.of_this_machine()
     operated.station.flush()

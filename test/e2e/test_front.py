@@ -176,7 +176,7 @@ def test_front_and_command_line_see_each_other_s_settings(nodes: dict[str, Node]
     assert run(node, 'get', 'talk.quality')['values'] == {'talk.quality': 65}
 
 
-def test_the_front_tells_how_the_node_is(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+def test_the_front_publishes_the_nodes_state(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
     """``/diagnostics`` has the same entries, with the robot as hardware."""
     heard: dict[str, Any] = {}
 
@@ -205,7 +205,7 @@ def test_whom_the_robot_finds_is_compared_by_a_front_alone(nodes: dict[str, Node
         assert not connection.ask('compare', found={})['ok']
 
 
-def test_the_front_tells_of_missions(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+def test_the_front_publishes_missions(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
     """Latched, when one begins and when it ends."""
     node, station = nodes[BESIDE], stations[BESIDE]
     heard: list[str] = []

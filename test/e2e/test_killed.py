@@ -155,7 +155,7 @@ def test_a_node_has_the_shared_memory_that_it_frees(processes: Processes) -> Non
 
 
 @pytest.mark.long('a kill')
-def test_a_killed_node_leaves_no_port_in_which_a_publisher_gets_stuck(processes: Processes) -> None:
+def test_a_killed_node_blocks_no_publisher(processes: Processes) -> None:
     """Though it dies while it processes a message: who looks after its ports tells Fast DDS before that looks."""
     node = processes.node()
     if not (ports := ports_of(node.popen.pid)):

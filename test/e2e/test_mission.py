@@ -57,7 +57,7 @@ def sees(folder: MissionFolder) -> bool:
     return story.last.get('distance_traveled_m', 0.0) > 0.5 and 'battery_pct' in story.last and story.counts['frame'] >= 2
 
 
-def test_a_mission_has_its_data_and_nothing_else_is_stored(
+def test_only_mission_data_is_stored(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects], tmp_path: Path
 ) -> None:
     """With ``mission.capture: mission`` all objects are of the mission's time and say so; the rest is counted as skipped."""

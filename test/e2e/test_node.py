@@ -80,7 +80,7 @@ def test_what_is_left_is_delivered_by_the_next_start(
 
 
 @pytest.mark.long('a node of its own that hangs')
-def test_a_second_signal_ends_it_at_once(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+def test_a_second_signal_exits_immediately(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """While it drains to a hung server, a second signal a second later ends it, and what is spooled is delivered later."""
     with Wire(seaweed.endpoint_url) as wire:
         wire.set(HANG)
@@ -143,7 +143,7 @@ def test_a_wrong_parameter_refuses_the_start(processes: Processes, parameters: d
     assert not (node.home / 'spool').exists()
 
 
-def test_a_parameter_file_that_is_none(processes: Processes) -> None:
+def test_an_invalid_parameter_file(processes: Processes) -> None:
     """A parameter file that cannot be read refuses the start as well, without a traceback."""
     node = processes.node(None, {}, '--params-file', '/nonexistent.yaml', ready=False)
     assert node.wait() == 2, node.log

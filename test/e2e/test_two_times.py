@@ -96,7 +96,7 @@ def test_a_batch_per_second_whatever_the_clock(objects: Objects) -> None:
 
 
 @pytest.mark.long('publishers with clocks of their own')
-def test_the_operator_is_told_which_clocks_are_off(node: Node, objects: Objects) -> None:
+def test_wrong_clocks_are_reported(node: Node, objects: Objects) -> None:
     """By how much, with the likely cause; a topic that is fine is not mentioned."""
     assert objects.contents
 

@@ -163,7 +163,7 @@ def test_a_server_that_forgets_the_condition(proved: S3Store, direct: S3Store, f
 
 @pytest.mark.parametrize(('there', 'content'), [(False, CONTENT), (True, CONTENT), (True, b'')])
 @pytest.mark.parametrize('fault', [Fault.ERROR_500, Fault.SLOW_DOWN, Fault.DENIED, Fault.SKEWED])
-def test_a_look_that_fails_for_a_moment_condemns_nobody(
+def test_a_transient_head_failure_quarantines_nothing(
     there: bool, content: bytes, fault: Fault, opened: S3Store, direct: S3Store, front: Front, spool: Spool
 ) -> None:
     """What asks for the reason may find that all is well by then, with or without the object."""
@@ -175,7 +175,7 @@ def test_a_look_that_fails_for_a_moment_condemns_nobody(
 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.filterwarnings('ignore:tzname')  # of half a date
-def test_an_answer_that_breaks_off_condemns_nobody(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
+def test_a_truncated_answer_quarantines_nothing(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
     """Wherever the answer about a key that is taken ends, the object is known again, or it is tried again."""
     item = spool(key, CONTENT)
     proved.put(item)

@@ -133,7 +133,7 @@ def test_the_order_of_time(ros: Any, format_name: str) -> None:
 
 
 @ARCHIVES
-def test_bad_messages_are_rejected_and_the_rest_goes_on(ros: Any, format_name: str) -> None:
+def test_bad_messages_are_rejected_and_the_rest_is_archived(ros: Any, format_name: str) -> None:
     """What cannot be encoded is counted by reason and is not in the archive; with nothing left there is none."""
     good = frame(ros, jpeg(1))
     encoding = pack(ros, COMPRESSED, b'', good, frame(ros, b''), good, format_name=format_name)

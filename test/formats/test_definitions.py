@@ -98,7 +98,7 @@ def test_the_first_workspace_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize('name', ['nowhere/msg/Thing', 'no type', '', '../../etc/passwd', 'std_msgs/srv/X', 'a/b/c/d'])
-def test_what_nobody_knows(name: str) -> None:
+def test_an_unknown_definition(name: str) -> None:
     """An unknown type has an empty definition, which readers take for none."""
     assert describe(name) == ('', '', '')
 

@@ -77,7 +77,7 @@ def test_the_object_describes_itself(ros: Any, type_name: str) -> None:
     assert type(made.body) is bytes
 
 
-def test_bad_samples_are_counted_and_the_rest_goes_on(ros: Any) -> None:
+def test_bad_samples_are_counted_and_the_rest_is_stored(ros: Any) -> None:
     """A batch loses exactly its bad samples; name and span come from those that are inside."""
     good = [ros.cdr(IMU, temperature=index) for index in range(3)]
     second = 1_000_000_000
@@ -114,7 +114,7 @@ def test_a_type_without_a_definition(ros: Any, format_name: str) -> None:
     assert (encoding.object is None) == bool(reason)
 
 
-def test_the_first_of_each_reason_is_told(ros: Any) -> None:
+def test_the_first_of_each_reason_is_reported(ros: Any) -> None:
     """In addition to its count, each reason has a sentence about the first sample."""
     encoding = ros.encode('sensor_msgs/msg/Image', b'', b'', ros.cdr('sensor_msgs/msg/Image', encoding='bayer_rggb8'))
     assert encoding.rejected == {'malformed': 2, 'empty': 1}
@@ -133,7 +133,7 @@ def test_serialized_bytes(ros: Any, type_name: str) -> None:
     assert ros.encode(type_name, cdr[:3], sensor='voxel_map').rejected == {'malformed': 1}
 
 
-def test_a_batch_of_pictures_loses_none_unseen(ros: Any) -> None:
+def test_a_batch_of_images_counts_every_loss(ros: Any) -> None:
     """A format of one message takes the first good one of a batch and counts the others."""
     good = ros.cdr(COMPRESSED, data=np.frombuffer(JPEG, np.uint8))
     encoding = ros.encode(COMPRESSED, b'', good, good, b'')

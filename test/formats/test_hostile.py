@@ -26,7 +26,7 @@ def test_hostile_messages(ros: Any) -> None:
     assert fuzzer.outcomes['encoded'] > ROUNDS / 10
 
 
-def test_lengths_that_lie_at_every_word(ros: Any) -> None:
+def test_false_lengths_at_every_word(ros: Any) -> None:
     """Each 4-byte word of a message of each type, replaced by the largest number, is refused or harmless at once."""
     fuzzer = Fuzzer(ros)
     for type_name in TYPES:

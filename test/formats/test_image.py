@@ -131,7 +131,7 @@ def test_quality(ros: Any) -> None:
         ({'encoding': '32FC1'}, 'size_mismatch'),
     ],
 )
-def test_raw_images_that_lie(ros: Any, lies: dict[str, Any], reason: str) -> None:
+def test_raw_images_with_false_sizes(ros: Any, lies: dict[str, Any], reason: str) -> None:
     """Inconsistent sizes and images without pixels have different reasons, for every format."""
     for format_name in ('jpeg', 'png'):
         result = raw(ros, gradient().reshape(48, -1), sensor={'format': format_name}, **({'encoding': 'bgr8'} | lies))

@@ -72,7 +72,7 @@ def test_a_png_cut_in_its_headers(ros: Any) -> None:
 
 
 @pytest.mark.parametrize('changes', [{16: 0x80}, {12: 0x4A}, {11: 12}, {16: 0, 17: 0, 18: 0, 19: 0}], ids=str)
-def test_a_png_whose_header_lies(ros: Any, changes: dict[int, int]) -> None:
+def test_a_png_with_a_false_header(ros: Any, changes: dict[int, int]) -> None:
     """Impossible sizes and a first chunk that is not the header are malformed."""
     data = bytearray(png())
     for at, value in changes.items():

@@ -118,7 +118,7 @@ def test_a_definition_that_is_no_text(tmp_path: Path) -> None:
     assert reason_of(MessageTypes([tmp_path]), 'bad_msgs/msg/A', b'\0\1\0\0') == 'unknown_type'
 
 
-def test_a_nested_type_is_usable_by_itself(ros: Any) -> None:
+def test_a_nested_type_is_usable_alone(ros: Any) -> None:
     """A type that was loaded as part of another can be requested afterwards."""
     types = MessageTypes()
     assert types.has_header('sensor_msgs/msg/PointCloud2')
@@ -173,14 +173,14 @@ print(len(reasons), set(reasons))
 
 
 @pytest.mark.parametrize('flags', [[], ['-O']], ids=['plain', 'optimized'])
-def test_lengths_that_lie_allocate_nothing(flags: list[str]) -> None:
+def test_false_lengths_allocate_nothing(flags: list[str]) -> None:
     """Lengths such as 0xFFFFFFFF are malformed within 2 GiB of address space, with assertions on or off."""
     done = subprocess.run([sys.executable, *flags, '-c', LYING], capture_output=True, text=True, timeout=60, check=False)
     assert done.stdout.endswith("{'malformed'}\n"), done.stdout + done.stderr
     assert int(done.stdout.split()[0]) > 50
 
 
-def test_threads_may_ask_at_once(ros: Any, prefix: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_may_read_concurrently(ros: Any, prefix: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight threads that ask one fresh object for the same types all get right answers, and each file is read once."""
     read = []
 

@@ -61,7 +61,7 @@ def test_a_plain_cloud(ros: Any) -> None:
     assert (result.object.metadata['points'], result.object.metadata['is_dense']) == ('5', 'true')
 
 
-def test_padding_is_left_out(ros: Any) -> None:
+def test_padding_is_removed(ros: Any) -> None:
     """PCL's usual layout (x y z, four bytes of nothing, intensity, twelve of nothing) is packed."""
     padded = np.full((4, 32), 0xEE, np.uint8)
     points = xyzi(4)
@@ -251,7 +251,7 @@ def test_fields_that_a_pcd_cannot_hold(ros: Any, fields: list[Any]) -> None:
         ({'fields': [('x', 0, 7, 5)]}, 'malformed'),
     ],
 )
-def test_clouds_that_lie(ros: Any, changes: dict[str, Any], reason: str) -> None:
+def test_clouds_with_false_sizes(ros: Any, changes: dict[str, Any], reason: str) -> None:
     """Sizes that contradict each other and fields that end outside the point are rejected, by reason."""
     values = {'fields': XYZI, 'data': xyzi().tobytes(), 'width': 5, 'point_step': 16} | changes
     result = ros.encode(CLOUD, cloud(ros, values.pop('fields'), values.pop('data'), **values))

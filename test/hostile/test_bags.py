@@ -60,7 +60,7 @@ def mcap(chunk: bytes, compression: str, claim: int) -> bytes:
 
 
 @pytest.mark.parametrize('compression', ['zstd', pytest.param('lz4', marks=pytest.mark.long('as for zstd'))])
-def test_a_chunk_that_lies_about_its_size_is_damaged(tmp_path: Path, compression: str) -> None:
+def test_a_chunk_with_a_false_size_is_damaged(tmp_path: Path, compression: str) -> None:
     """In a tenth of the memory that it would take, whether it says too little or the truth."""
     chunk, claims = zeros(compression), (100, 1 << 20, HUGE, (1 << 63) - 1)
     for claim in claims:
@@ -84,7 +84,7 @@ def in_2_gb(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_a_file_that_is_one_record_is_not_read_whole(tmp_path: Path) -> None:
+def test_a_file_with_one_huge_record_is_not_loaded(tmp_path: Path) -> None:
     """A sparse file of three gigabytes whose only record, or whose summary, is all of it."""
     for name, summary in (('record', 0), ('summary', len(MAGIC))):
         path = tmp_path / name / 'evil.mcap'
@@ -124,14 +124,14 @@ FINE = {'storage': 'mcap', 'duration': '5', 'start': '7', 'name': '/a', 'qos': '
     ],
     ids=range(13),
 )  # fmt: skip
-def test_metadata_that_are_none_are_damaged(changed: dict[str, str]) -> None:
+def test_invalid_metadata_is_damage(changed: dict[str, str]) -> None:
     """Aliases that stand for more than there is memory, depth, dates that no clock shows, lists for texts."""
     assert describe_metadata(YAML.format(**FINE).encode(), 'x').messages == 1
     with pytest.raises(BagDamaged, match='metadata'):
         describe_metadata(YAML.format(**{**FINE, **changed}).encode(), 'x')
 
 
-def test_qos_that_is_none_is_nobodys_qos() -> None:
+def test_invalid_qos_is_ignored() -> None:
     """Of a topic, and only of that."""
     for qos in ("'[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[['", f"'{LAUGHS}'", '"' + 70_000 * 'a' + '"', '"- {a: 1"'):
         assert describe_metadata(YAML.format(**{**FINE, 'qos': qos}).encode(), 'x').topics[0].qos == ()
@@ -141,7 +141,7 @@ def test_qos_that_is_none_is_nobodys_qos() -> None:
     'told', [b'[' * 100_000, b'{"version": ' + b'9' * 5000 + b'}', b'{"a": ' + b'[' * 900 + b']' * 900 + b'}', bytes(17 << 20)],
     ids=range(4),
 )  # fmt: skip
-def test_a_manifest_that_is_none_is_damaged(told: bytes) -> None:
+def test_an_invalid_manifest_is_damage(told: bytes) -> None:
     with pytest.raises(BagDamaged):
         Manifest.from_json(told)
 
@@ -150,7 +150,7 @@ def test_a_manifest_that_is_none_is_damaged(told: bytes) -> None:
     ('name', 'value'),
     [('state', [[]] * 1000), ('bag', 10**400), ('missing', 7), ('event', {'name': 'x', 'triggers': [], 'pre_s': 10**400})],
 )
-def test_a_field_of_a_manifest_that_is_none_is_named(tmp_path: Path, name: str, value: object) -> None:
+def test_an_invalid_field_of_a_manifest_is_named(tmp_path: Path, name: str, value: object) -> None:
     """And what stands there is not printed at any length."""
     write_ours(tmp_path / NAME, slices=1)
     told = json.loads((tmp_path / NAME / 'manifest.json').read_bytes())
@@ -228,7 +228,7 @@ def test_a_sqlite_bag_is_no_program(tmp_path: Path, sql: str, says: str) -> None
 
 @pytest.mark.parametrize('plugin', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 @pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_what_is_packed_outside_the_storage_is_cut_as_it_is(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
+def test_externally_compressed_messages_are_cut_unchanged(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
     """Both storages, both ways."""
     write_rosbags(tmp_path / 'bag', plugin, mode, count=20)
     found = cut_folder(tmp_path / 'bag', tmp_path / 'out', Choice(topics=['/text']))

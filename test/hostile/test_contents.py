@@ -173,7 +173,7 @@ def packed_zip(how: int) -> bytes:
     ids=['a hole of a terabyte', 'many in a tar', 'many in a zip', 'deflated', 'LZMA'],
 )  # fmt: skip
 @pytest.mark.long('archives of many')
-def test_an_archive_holds_no_more_than_it_is_large(make: Callable[[], bytes], kind: str) -> None:
+def test_an_archive_cannot_exceed_its_size(make: Callable[[], bytes], kind: str) -> None:
     """Robots store what is in it as it is."""
     body = make()
     with pytest.raises(LakeError, match=f'the {kind} cannot be read'):
@@ -205,7 +205,7 @@ def test_records_that_are_too_deep_or_too_large() -> None:
         decode.records(b' ' * (33 << 20))
 
 
-def test_no_more_of_an_object_is_read_than_its_row_says() -> None:
+def test_at_most_the_size_in_the_row_is_read() -> None:
     """And none that is larger than any that is decoded."""
     asked: list[int] = []
 
@@ -224,7 +224,7 @@ def test_no_more_of_an_object_is_read_than_its_row_says() -> None:
 @pytest.mark.parametrize(
     'told', [b'[' * 100_000, b'{"result": "' + b'a' * (2 << 20) + b'"}', b'{' * 5 + b'1' * 5000], ids=range(3)
 )
-def test_a_summary_that_is_none_costs_its_own_figures_alone(tmp_path: Path, told: bytes) -> None:
+def test_an_invalid_summary_affects_only_its_mission(tmp_path: Path, told: bytes) -> None:
     """However deep or large it is."""
     settings = folder_store(tmp_path)
     path = settings.directory / schema.BUCKET / 'thor/missions/run/summary.json'
@@ -233,7 +233,7 @@ def test_a_summary_that_is_none_costs_its_own_figures_alone(tmp_path: Path, told
     assert len(uploaded(Bucket(settings, schema.BUCKET), [('thor', 'run')])) == 0
 
 
-def test_an_object_of_which_a_row_claims_a_million_messages_is_left_out(tmp_path: Path) -> None:
+def test_a_row_that_claims_a_million_messages_is_skipped(tmp_path: Path) -> None:
     """A data set would have as many samples."""
     from hostile import bad_parts
 

@@ -65,7 +65,7 @@ def run(command: Callable[..., object], home: Path, *arguments: str) -> Result:
 
 
 @pytest.mark.parametrize('kind', BAD)
-def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kind: str) -> None:
+def test_a_bad_part_affects_no_other_robot(home: Path, kind: str) -> None:
     """``query``, ``lake coverage`` and ``known`` answer with the rest, name the part, and say that there is one."""
     source = Bucket(folder_store(home), schema.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source)
@@ -129,7 +129,7 @@ NUMBERS = st.none() | st.integers(-(1 << 63), MOST) | st.integers(NOON_NS, END_N
     'skipped': st.none() | st.integers(0, MOST), 'grade': st.none() | st.text(max_size=3) | st.just('exact'),
     'cause': st.none() | st.text(max_size=3), 'kind': st.none(), 'clock': st.none() | st.just('unset'),
 }), max_size=6))  # fmt: skip
-def test_whatever_rows_say_the_time_is_told_once(given_: list[dict[str, Any]]) -> None:
+def test_hostile_rows_partition_time(given_: list[dict[str, Any]]) -> None:
     """Any times and counts give stretches that fill the time, one after the other."""
     rows = [{**ROWS[0], **row, 'id': str(number)} for number, row in enumerate(given_)]
     found = of_rows('thor', 'objects', '/imu', NOON_NS, END_NS, rows)

@@ -94,7 +94,7 @@ ALONE = [pytest.param([kind], marks=pytest.mark.long('alone')) for kind in FEW]
 
 
 @pytest.mark.parametrize('kinds', [BAD, *ALONE], ids=['all', *FEW])
-def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kinds: Collection[str]) -> None:
+def test_a_bad_part_affects_no_other_robot(home: Path, kinds: Collection[str]) -> None:
     """``query`` answers with all other rows, names each such part, and its exit code says that there is one."""
     before = good(home)
     assert run(query, home).return_value == 0
@@ -109,7 +109,7 @@ def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kinds: Collection[st
 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('kind', [*FEW, 'of tachi', 'a bomb'])
-def test_every_command_goes_on_without_it(home: Path, tmp_path: Path, kind: str) -> None:
+def test_every_command_continues_without_it(home: Path, tmp_path: Path, kind: str) -> None:
     """``lake verify``, ``fetch``, ``lake reindex`` and ``lake ingest``: the others are verified, fetched, known and ingested."""
     before = good(home)
     key = bad_parts.put(folder_store(home), BAD[kind]())
@@ -142,7 +142,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
     assert '3 rows are rejected: names another robot (first in line 3)' in str(next(iter(findings)))
 
 
-def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:
+def test_a_dataset_reports_what_it_skips(home: Path) -> None:
     """And has all the rest."""
     source = Bucket(folder_store(home), schema.BUCKET)
     count = len(lake.MissionDataset(source))
@@ -174,7 +174,7 @@ def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None
 
 
 @pytest.mark.long('commands in little memory')
-def test_a_bomb_is_left_out_in_little_memory(home: Path) -> None:
+def test_a_decompression_bomb_is_skipped_in_little_memory(home: Path) -> None:
     """``query`` and ``lake ingest`` end normally and name it."""
     key = bad_parts.put(folder_store(home), bad_parts.bomb())
     for arguments in (('query', '--format', 'keys'), ('lake', 'ingest')):

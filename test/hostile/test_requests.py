@@ -100,7 +100,7 @@ HOSTILE: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize('kind', HOSTILE)
-def test_hostile_labels_of_a_robot_harm_nobody_else(tmp_path: Path, kind: str) -> None:
+def test_hostile_labels_affect_no_other_robot(tmp_path: Path, kind: str) -> None:
     """The label beside it is shown, and every verb that reads labels answers without a control character."""
     fill(folder_store(tmp_path), tmp_path, days=(0,), hours=(12,))
     source = Bucket(folder_store(tmp_path), 'sensor-data')

@@ -143,7 +143,7 @@ def test_repeats_are_samples_of_their_own(tmp_path: Path) -> None:
     assert all(np.array_equal(dataset[number]['image'], shown[number]) for number in range(6))
 
 
-def test_what_is_too_far_away_is_missing(tmp_path: Path) -> None:
+def test_messages_too_far_in_time_are_missing(tmp_path: Path) -> None:
     """Numbers are NaN, a cloud has no point, the mask says so; all samples keep one shape."""
     settings = folder_store(tmp_path)
     partly = Drive(settings, tmp_path)
@@ -198,7 +198,7 @@ def test_the_poses_of_all_samples_are_those_of_each(tmp_path: Path) -> None:
     assert dataset.poses == pytest.approx(np.array([dataset[number]['pose'] for number in range(len(dataset))]))
 
 
-def test_incomplete_samples_can_be_left_out(tmp_path: Path) -> None:
+def test_incomplete_samples_can_be_dropped(tmp_path: Path) -> None:
     """By the catalog in what is counted, and message by message in a stream."""
     settings = folder_store(tmp_path)
     partly = Drive(settings, tmp_path)
@@ -351,7 +351,7 @@ def test_the_index_of_a_million_objects_is_small() -> None:
     [('0123456789abcdef' * 4, '0123456789abcdef' * 4), (None, ''), ('', ''), ('AB' * 32, '00' * 32), ('ab' * 31, '00' * 32),
      ('no hex', '00' * 32), ('ab ' * 32, '00' * 32)],
 )  # fmt: skip
-def test_a_checksum_that_is_none_fits_no_content(told: str | None, kept: str) -> None:
+def test_an_invalid_checksum_matches_no_content(told: str | None, kept: str) -> None:
     """It is kept as 32 bytes: only what is not known at all is not compared."""
     row = {**dict.fromkeys(NEEDED), 'robot': 'thor', 'sensor': 'camera', 'key': 'thor/camera/1.jpg', 'bucket': BUCKET, 'bytes': 9,
            'sha256': told, 't_start_ns': NOON_NS}  # fmt: skip

@@ -67,7 +67,7 @@ def test_frames_are_judged_by_several_processes(tmp_path: Path, seaweed: Tower) 
 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('example', ['train_navigation_policy.py', 'fleet_frames.py'])
-def test_each_says_how_it_is_used(example: str) -> None:
+def test_each_example_has_a_usage_line(example: str) -> None:
     """``--help`` names what it needs."""
     if example.startswith('train') and importlib.util.find_spec('torch') is None:
         pytest.skip('torch is not installed (the extra "train")')

@@ -59,7 +59,7 @@ def stamps(stream: Any) -> list[int]:
     return [int(sample['stamp_ns']) for sample in stream]
 
 
-def test_workers_have_whole_shards_and_all_of_them(source: Bucket, in_worker: Any) -> None:
+def test_workers_cover_all_shards_completely(source: Bucket, in_worker: Any) -> None:
     """Three workers: no archive is read by two, every frame comes once; a DataLoader takes the stream for an IterableDataset."""
     frames = MissionDataset(source)
     got = []

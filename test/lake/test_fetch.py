@@ -210,7 +210,7 @@ def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_
     assert all(found.failed.values())
 
 
-def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_store_ends_it(settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not each of a million objects is tried; what concerns all of them is raised."""
     monkeypatch.setattr(retry, 'BASE_S', 0.001)
     tried = 0

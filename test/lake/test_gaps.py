@@ -40,7 +40,7 @@ def seconds(found: lake.Known) -> list[tuple[float, float, tuple[str, ...], str]
             for each in found.stretches]  # fmt: skip
 
 
-def test_without_a_statement_nobody_knows(store: StoreSettings) -> None:
+def test_without_a_watermark_gaps_are_unknown(store: StoreSettings) -> None:
     """Without statements, the absence of gaps means nothing: for a robot that never reported, and for a topic."""
     found = ask(store, 0, 10)
     assert seconds(found) == [(0, 10, (), '')]
@@ -63,7 +63,7 @@ def test_by_received_a_gap_is_when_its_messages_would_have_arrived(store: StoreS
     assert covered.known.stretches == found.stretches
 
 
-def test_below_the_watermark_no_row_is_no_gap_and_above_it_nobody_knows(store: StoreSettings, tmp_path: Path) -> None:
+def test_no_row_means_no_gap_only_below_the_watermark(store: StoreSettings, tmp_path: Path) -> None:
     """Complete, a gap, complete, and then a time that is not reported yet."""
     tell(store, tmp_path, mark(60), lost('1', 20, 23))
     found = ask(store, 10, 90)
@@ -76,7 +76,7 @@ def test_below_the_watermark_no_row_is_no_gap_and_above_it_nobody_knows(store: S
     assert not ask(store, 25, 61).is_whole
 
 
-def test_a_gap_that_is_told_is_known_above_the_watermark_too(store: StoreSettings, tmp_path: Path) -> None:
+def test_a_reported_gap_above_the_watermark_is_known(store: StoreSettings, tmp_path: Path) -> None:
     """Like a gap without times: it is listed, but belongs to no time."""
     untimed = statement('thor', GAP, 'j/9', 1, **IMU, kind='dropped', cause='queue_full', count=7)
     tell(store, tmp_path, mark(10), lost('1', 8, 14), untimed)
@@ -104,7 +104,7 @@ def test_messages_of_another_type_are_nothing_of_the_topic(store: StoreSettings,
     assert (found.is_whole, len(found.gaps)) == (True, 1)
 
 
-def test_the_time_between_two_sessions_is_not_known_unless_told(store: StoreSettings, tmp_path: Path) -> None:
+def test_the_time_between_sessions_is_unknown_unless_reported(store: StoreSettings, tmp_path: Path) -> None:
     """After a node was off, sequence numbers that continued show what was lost, as soon as they arrive."""
     tell(store, tmp_path, mark(60), mark(300, 2, 200, session=2))
     assert seconds(ask(store, 0, 300)) == [(0, 60, (), 'exact'), (60, 200, (), ''), (200, 300, (), 'exact')]
@@ -130,7 +130,7 @@ def test_a_gap_over_midnight_is_found_from_either_day(store: StoreSettings, tmp_
     assert ask(store, 0, 100).is_whole
 
 
-def test_a_gap_that_moves_to_another_day_is_told_once(store: StoreSettings, tmp_path: Path) -> None:
+def test_a_gap_that_moves_to_another_day_is_reported_once(store: StoreSettings, tmp_path: Path) -> None:
     """Its withdrawal stays under the old date; who reads both days sees it once, who reads either sees what holds."""
     day_s = DAY_NS // SECOND
     tell(store, tmp_path, lost('1', 100, day_s + 100), mark(day_s + 200))
@@ -157,7 +157,7 @@ def test_of_what_was_stated_often_the_newest_counts(store: StoreSettings, tmp_pa
     assert gaps.newest(Bucket(store, BUCKET))['count'].to_pylist() == [30] * 5
 
 
-def test_a_question_that_is_none(store: StoreSettings) -> None:
+def test_an_invalid_time_range(store: StoreSettings) -> None:
     """It says what is wrong, and what is allowed."""
     with pytest.raises(SettingError, match='sink'):
         known('thor', '/imu', 0, 1, sink='tape', source=Bucket(store, BUCKET))
@@ -189,7 +189,7 @@ def test_the_order_of_statements_does_not_matter(rows: list[Statement], random: 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 9), st.sampled_from('ab')), max_size=12),
        st.lists(st.tuples(st.integers(0, 50), st.integers(1, 30)), max_size=4))  # fmt: skip
-def test_every_instant_is_in_one_stretch_and_says_what_the_rows_say(gaps: list[tuple[int, int, str]],
+def test_stretches_partition_time_and_match_the_rows(gaps: list[tuple[int, int, str]],
                                                                      marks: list[tuple[int, int]]) -> None:  # fmt: skip
     """Compared with a query for each second."""
     rows = [lost(str(number), first, first + size, cause=cause) for number, (first, size, cause) in enumerate(gaps)]
@@ -271,7 +271,7 @@ def test_a_part_with_a_cause_for_each_row_is_answered_with_few() -> None:
     assert found.stretches[-1].causes == ('cause-0',)
 
 
-def test_a_stretch_says_what_it_is() -> None:
+def test_a_stretch_has_a_state() -> None:
     """Whole, open, or neither."""
     kinds = [Stretch(0, 1, (), 'exact'), Stretch(0, 1, (), ''), Stretch(0, 1, ('restart',), ''), Stretch(0, 1, ('a',), 'exact')]
     assert [(each.is_whole, each.is_open) for each in kinds] == [(True, False), (False, True), (False, False), (False, False)]

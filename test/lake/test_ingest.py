@@ -167,7 +167,7 @@ def test_a_kill_between_the_rows_and_the_record_of_their_file_repeats_nothing(
     assert pending(tables.open(INGESTED), row_files(bucket(tmp_path), Findings(), Scope())) == []
 
 
-def test_files_that_are_not_ingested_are_read_beside_the_tables(tmp_path: Path, tables: Tables) -> None:
+def test_row_files_are_read_in_addition_to_the_tables(tmp_path: Path, tables: Tables) -> None:
     """The rows that a version lacks: all of a new file, none of one whose rows were committed without their record."""
     source = bucket(tmp_path)
     old = [row('camera', NOON_NS + second * SECOND) for second in range(3)]

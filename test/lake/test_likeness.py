@@ -80,7 +80,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_pair(tmp_path_factory.mktemp('models') / 'colours')
 
 
-def test_the_likest_come_first(lake: Lake, pair: Path) -> None:
+def test_the_most_similar_come_first(lake: Lake, pair: Path) -> None:
     """By a picture and by words, within what the flags choose."""
     model = OnnxPair.open(pair)
     found = embed(lake.store, lake.source, model)
@@ -105,7 +105,7 @@ def test_what_has_a_vector_is_not_looked_at_again(lake: Lake, pair: Path) -> Non
     assert lake.parts() == before
 
 
-def test_another_model_has_vectors_of_its_own(lake: Lake, pair: Path, tmp_path: Path) -> None:
+def test_each_model_has_separate_vectors(lake: Lake, pair: Path, tmp_path: Path) -> None:
     """A model that was changed is another one, and none of its answers comes from vectors of the old one."""
     embed(lake.store, lake.source, OnnxPair.open(pair))
     changed = OnnxPair.open(make_pair(tmp_path / 'colours', scale=2.0))
@@ -115,7 +115,7 @@ def test_another_model_has_vectors_of_its_own(lake: Lake, pair: Path, tmp_path: 
     assert embed(lake.store, lake.source, changed).made == 4
 
 
-def test_pictures_that_are_none_are_counted_by_reason(lake: Lake, pair: Path) -> None:
+def test_invalid_images_are_counted_by_reason(lake: Lake, pair: Path) -> None:
     lake.add('torn', picture((1, 2, 3))[:60], NOON_NS + 100 * SECOND)
     lake.add('changed', picture((1, 2, 4)), NOON_NS + 101 * SECOND, sha256='0' * 64)
     lake.add('gone', picture((1, 2, 5)), NOON_NS + 102 * SECOND)
@@ -129,7 +129,7 @@ def test_pictures_that_are_none_are_counted_by_reason(lake: Lake, pair: Path) ->
 @pytest.mark.parametrize(
     'fault', ['truncated', 'of another model', 'nan', 'half the numbers', 'other columns', 'too many rows', 'noise']
 )
-def test_parts_that_are_none_are_left_out_and_named(lake: Lake, pair: Path, fault: str) -> None:
+def test_invalid_parts_are_skipped_and_named(lake: Lake, pair: Path, fault: str) -> None:
     model = OnnxPair.open(pair)
     embed(lake.store, lake.source, model)
     first, second = lake.parts()

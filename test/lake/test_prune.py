@@ -136,7 +136,7 @@ def settings(filled: Path, tmp_path: Path) -> StoreSettings:
     return folder_store(tmp_path)
 
 
-def test_what_a_rule_names_goes_and_nothing_else(settings: StoreSettings) -> None:
+def test_prune_deletes_exactly_what_a_rule_names(settings: StoreSettings) -> None:
     """By sensor and age. The catalog names the rest, rows of deleted objects have the time, and a second run finds nothing."""
     before = _stored(settings)
     done = _run(settings)
@@ -155,7 +155,7 @@ def test_what_a_rule_names_goes_and_nothing_else(settings: StoreSettings) -> Non
         assert reindex(_source(settings), store, 'thor').gone == 0
 
 
-def test_the_gap_journal_says_what_was_deleted(settings: StoreSettings, tmp_path: Path) -> None:
+def test_the_gap_journal_lists_deletions(settings: StoreSettings, tmp_path: Path) -> None:
     """Of each hour one gap with its messages, which a later prune of more of that hour replaces."""
     began_ns = NOW_NS - 9 * DAY_NS
     with closing(open_store(settings, UploadSettings())) as store:
@@ -209,7 +209,7 @@ def test_a_label_that_cannot_be_read_stops_it(settings: StoreSettings, tmp_path:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_a_bag_goes_as_a_whole_or_not_at_all(settings: StoreSettings, tmp_path: Path) -> None:
+def test_a_bag_is_deleted_completely_or_not_at_all(settings: StoreSettings, tmp_path: Path) -> None:
     """When its last slice is old. An event's bag has a separate rule; without a manifest it is unknown which one applies."""
     tmp = tmp_path / 'tmp'
     old = _add_bag(settings, tmp, 'old', NOW_NS - 8 * DAY_NS)
@@ -329,7 +329,7 @@ def test_it_may_die_anywhere(tmp_path: Path) -> None:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_two_at_once_delete_once(settings: StoreSettings) -> None:
+def test_two_concurrent_prunes_delete_once(settings: StoreSettings) -> None:
     """Both find the same; each object has one row that counts, and its messages are counted once."""
     with closing(open_store(settings, UploadSettings())) as store:
         plans = [_plan(settings), _plan(settings, 'camera 7d')]
@@ -367,7 +367,7 @@ def test_merging_changes_nothing_of_it(settings: StoreSettings) -> None:
     assert len(_answer(settings)) == 48
 
 
-def test_without_the_right_to_delete_it_says_whose_it_takes(settings: StoreSettings) -> None:
+def test_missing_permission_names_the_required_user(settings: StoreSettings) -> None:
     """And with that right the next run deletes what is written down."""
 
     class Denying(MortalStore):
@@ -386,7 +386,7 @@ def test_without_the_right_to_delete_it_says_whose_it_takes(settings: StoreSetti
 
 @pytest.mark.parametrize('text', ['', 'camera', 'camera 90', 'camera 90d lidar 14d', 'camera 1d, camera 2d', '_ledger 1d',
                                   'bag 1d, bags 2d', 'camera 2999-01-01', 'camera/ 1d', 'camera 90d,'])  # fmt: skip
-def test_rules_that_are_none_are_refused(text: str) -> None:
+def test_invalid_rules_are_rejected(text: str) -> None:
     """With the setting and what is allowed."""
     with pytest.raises(SettingError, match='--keep'):
         prune.keep_rules(text, NOW_NS)

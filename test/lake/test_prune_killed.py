@@ -70,7 +70,7 @@ def ended(processes: Sequence[subprocess.Popen[str]]) -> list[str]:
 @pytest.mark.seaweedfs
 @pytest.mark.slow
 @pytest.mark.long('kills')
-def test_killed_beside_readers_a_compaction_and_another_prune(seaweed: Tower, tmp_path: Path) -> None:
+def test_killed_during_reads_a_compaction_and_another_prune(seaweed: Tower, tmp_path: Path) -> None:
     """In the end exactly what the rule names is deleted, with one row each; concurrent readers can read all the rest."""
     now_ns, chance = time.time_ns(), random.Random(7)
     ages = range(10)

@@ -133,7 +133,7 @@ def test_a_pull_from_asking_to_arrival(field: Field) -> None:
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_what_was_thinned_is_known_as_it_is_now(tmp_path: Path, seed: int) -> None:
+def test_thinned_objects_have_their_current_size(tmp_path: Path, seed: int) -> None:
     """The robot reports it again, with fewer bytes, and in any order that row counts; of what is lost the row that says so."""
     found = [('a', 'robot', 100), ('a', 'robot', 50), ('b', 'robot', 10), ('a', 'robot', 80), ('b', 'lost', 10)]
     random.Random(seed).shuffle(found)
@@ -158,7 +158,7 @@ def test_waiting_ends_with_the_last_answer(field: Field, monkeypatch: pytest.Mon
     assert [one['id'] for one in run('pull', '--list')] == [second['id']]
 
 
-def test_what_is_lost_on_the_robot_is_told(field: Field) -> None:
+def test_objects_lost_on_the_robot_are_reported(field: Field) -> None:
     """The row of a loss supersedes that of what was kept, before and after a merge, and so does that of an arrival."""
     field.records(*range(8), size=200 << 10)
     assert field.kept() == [3, 4, 5, 6, 7]
@@ -192,7 +192,7 @@ def test_a_request_is_taken_back(field: Field) -> None:
     assert (answer.state, answer.outcomes) == ('cancelled', {'unsent': ObjectCount(1, 1000)})
 
 
-def test_times_labels_and_sql_choose_what_is_asked_for(field: Field, tmp_path: Path) -> None:
+def test_times_labels_and_sql_select_the_request(field: Field, tmp_path: Path) -> None:
     """And nothing else: the robot gets a request for these names, and none if nothing is selected."""
     field.records(*range(8))
     ranges = tmp_path / 'ranges.json'
@@ -219,7 +219,7 @@ def test_times_labels_and_sql_choose_what_is_asked_for(field: Field, tmp_path: P
     (), ('--where', 'nonsense('), ('--bag', '../x'), ('--sensor', 'camera', '--expires', '100d'), ('--cancel', 'x'),
     ('--failed',), ('--policy', 'p'), ('--sensor', 'camera', '--user', '../x'),
 ])  # fmt: skip
-def test_what_cannot_be_asked_for_is_said(field: Field, arguments: tuple[str, ...]) -> None:
+def test_unavailable_data_is_reported(field: Field, arguments: tuple[str, ...]) -> None:
     """Before anything is written."""
     field.records(1)
     done = CliRunner().invoke(cli, ['pull', *arguments], standalone_mode=False)
@@ -254,7 +254,7 @@ def test_a_name_that_nothing_has_is_wrong_usage(field: Field, arguments: list[st
 
 
 @pytest.mark.long('a picture by matplotlib')
-def test_the_pace_of_the_link_says_how_long_a_pull_takes(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_throughput_predicts_the_duration_of_a_pull(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The median of what the robot measured lately; the same by place is a picture."""
     field.records(1, 2)
     samples = [
@@ -290,7 +290,7 @@ def test_a_data_set_asks_for_what_is_kept(field: Field, tmp_path: Path, monkeypa
         MissionDataset(tmp_path / 'folder', pull=True)
 
 
-def test_a_pull_that_a_robot_does_not_finish_is_said(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfinished_pull_is_reported(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
     """With how far it came."""
     field.records(1)
     field.server._release = lambda _: False  # type: ignore[method-assign] # it has no link

@@ -66,7 +66,7 @@ def found(source: Any, **flags: Any) -> list[str]:
     ],
     ids=lambda value: str(value)[:40] if isinstance(value, dict) else '',
 )  # fmt: skip
-def test_flags_mean_what_they_say(
+def test_flags_select_rows(
     world: tuple[StoreSettings, list[schema.Row]], flags: dict[str, Any], holds: Callable[[schema.Row], bool]
 ) -> None:
     """The answer is what a loop over all rows finds."""
@@ -135,7 +135,7 @@ def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, l
     assert answer[0]['t_start'].timestamp() * 1e6 == first['t_start']
 
 
-def test_only_the_asked_days_are_asked_for(tmp_path: Path) -> None:
+def test_only_requested_days_are_read(tmp_path: Path) -> None:
     """Of other days not even the names; what is in the tables is not read again."""
     fill(folder_store(tmp_path), tmp_path / 'tmp')
     source = watched(folder_store(tmp_path))
@@ -199,7 +199,7 @@ def test_a_file_that_goes_while_a_folder_is_listed_is_no_error(tmp_path: Path) -
     assert len(lake.objects(Bucket(settings, schema.BUCKET))) == len(rows)
 
 
-def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> None:
+def test_a_mission_without_a_summary_has_no_end(tmp_path: Path) -> None:
     """It is still running, or its robot is unreachable: neither failed nor succeeded."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
@@ -306,7 +306,7 @@ def through(front: Front, tower: Tower) -> StoreSettings:
 
 
 @pytest.mark.seaweedfs
-def test_a_real_server_is_asked_for_that_day_alone(seaweed: Tower, tmp_path: Path) -> None:
+def test_only_that_day_is_read_from_a_real_server(seaweed: Tower, tmp_path: Path) -> None:
     """What goes over the wire names no other day; the answer is that of the folder; no secret shows anywhere."""
     fill(seaweed.store_settings(), tmp_path)
     rows = [row for _, each in minutes() for row in each]
@@ -330,7 +330,7 @@ def test_a_real_server_is_asked_for_that_day_alone(seaweed: Tower, tmp_path: Pat
 
 
 @pytest.mark.seaweedfs
-def test_wrong_credentials_are_told_without_showing_them(seaweed: Tower) -> None:
+def test_wrong_credentials_are_reported_without_showing_them(seaweed: Tower) -> None:
     """The error is ours and has neither key nor secret."""
     plain = seaweed.store_settings()
     wrong = StoreSettings(endpoint_url=plain.endpoint_url, access_key_id=plain.access_key_id, secret_access_key='not the secret')
@@ -347,7 +347,7 @@ def test_wrong_credentials_are_told_without_showing_them(seaweed: Tower) -> None
      ({'access_key_id': 'k'}, SettingError, 'AWS_SECRET_ACCESS_KEY'),
      ({'secret_access_key': 's'}, SettingError, 'AWS_ACCESS_KEY_ID')],
 )  # fmt: skip
-def test_credentials_that_are_not_there_are_told(
+def test_missing_credentials_are_reported(
     keys: dict[str, str], error: type[Exception], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """No model, or half a pair: the missing one is reported before any request."""

@@ -88,7 +88,7 @@ def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, t
     assert answer(settings) == ALL
 
 
-def test_it_goes_on_where_it_died(settings: StoreSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_reindex_resumes(settings: StoreSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     """Parts of what was asked so far are there; the next run asks for the rest."""
     monkeypatch.setattr(library, 'PAGE', 4)
     asked: list[str] = []

@@ -134,7 +134,7 @@ def test_no_query_is_obeyed(index: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize('text', ['', '   ', '"door', '-door', 'door OR', 'OR', '***', '\x00', ' '.join('x' * 40)])
-def test_what_is_no_query_is_told(index: Path, text: str) -> None:
+def test_an_invalid_query_is_reported(index: Path, text: str) -> None:
     """With what is allowed."""
     with pytest.raises(SettingError, match='phrase'):
         search.search(index, text, wanted(0))
@@ -187,7 +187,7 @@ def test_words_of_scripts_without_spaces(commands: Path, query: str, expected: s
     assert sorted(map(str, missions(commands, query))) == expected.split()
 
 
-def test_what_was_said_is_shown_as_it_was_said(commands: Path) -> None:
+def test_excerpts_are_verbatim(commands: Path) -> None:
     """Nothing of how the index is made can be seen in an answer."""
     for query in ('厨房', 'ドア', 'ประตู', 'küche*'):
         (found,) = search.search(commands, query, wanted(0))

@@ -23,7 +23,7 @@ def test_what_is_no_circle_is_refused(near: str) -> None:
 
 
 @given(st.integers(0, 40 * DAY_NS), st.integers(1, 40 * DAY_NS), st.integers(0, 80 * DAY_NS))
-def test_the_dates_hold_every_wanted_moment_and_no_more_days(since: int, span: int, at: int) -> None:
+def test_dates_cover_the_range_exactly(since: int, span: int, at: int) -> None:
     """A moment is wanted only if its date is among them; the first and the last date hold one."""
     asked = Wanted(since_ns=MIDNIGHT_NS + since, until_ns=MIDNIGHT_NS + since + span)
     dates = asked.dates(NOON_NS)
@@ -38,7 +38,7 @@ def test_the_dates_hold_every_wanted_moment_and_no_more_days(since: int, span: i
     assert dates[-1] == f'{utc(MIDNIGHT_NS + since + span - 1):%Y-%m-%d}'
 
 
-def test_without_an_end_it_goes_on_to_tomorrow() -> None:
+def test_without_an_end_the_range_extends_to_tomorrow() -> None:
     """A robot's clock may be a day ahead (clock.FUTURE_SLACK_NS)."""
     assert Wanted(since_ns=NOON_NS).dates(NOON_NS) == ['2026-10-28', '2026-10-29']
 

@@ -171,7 +171,7 @@ def test_an_index_that_was_deleted_is_filled_again(url: str, settings: StoreSett
     assert again.added == whole['objects'] + whole['events']
 
 
-def test_what_was_pruned_says_so(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_pruned_objects_are_marked(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """Its document keeps all fields, whenever the deletion is sent, and exists once."""
     with closing(open_store(settings, UploadSettings())) as store:
         row = fill_row()
@@ -288,7 +288,7 @@ def test_what_passes_is_tried_again(url: str, settings: StoreSettings, tmp_path:
     assert send(url, settings, tmp_path).added == 0
 
 
-def test_a_server_that_stays_away(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_a_server_that_stays_unreachable(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """The error has a remedy, and what the server accepted before is recorded."""
     with between(url, lambda number, _: (429, b'{}') if number > 1 else None) as (proxy, _):
         with pytest.raises(SinkUnavailable, match='is overloaded or unavailable'):
@@ -351,14 +351,14 @@ def test_a_request_that_is_too_large_is_halved(url: str, settings: StoreSettings
 
 
 @pytest.mark.parametrize('answer', [b'<html>', b'{"items": []}', b'{"items": [1]}'])
-def test_an_answer_that_is_none(url: str, settings: StoreSettings, tmp_path: Path, answer: bytes) -> None:
+def test_an_invalid_answer(url: str, settings: StoreSettings, tmp_path: Path, answer: bytes) -> None:
     """Nothing counts as sent."""
     with between(url, lambda *_: (200, answer)) as (proxy, _), pytest.raises(LakeError):
         send(proxy, settings, tmp_path)
     assert send(url, settings, tmp_path).present == 0
 
 
-def test_a_part_that_is_none_is_told_each_time(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_an_invalid_part_is_reported_each_time(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """And keeps nothing else back."""
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path, 'thor/_catalog/date=2026-10-28/thor_x.jsonl.zst', b'it is not')
@@ -430,7 +430,7 @@ def test_dashboards(kind: str) -> None:
     assert {name for each in objects for name in fields(each)} <= set(known)
 
 
-def test_the_command_tells_what_was_refused(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_the_command_reports_rejected_documents(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """In JSON as on the screen, with exit code 1; the second run has nothing to send."""
     home = {'SHADOWHOUND_HOME': str(tmp_path), 'AWS_ENDPOINT_URL': ''}
 
@@ -447,7 +447,7 @@ def test_the_command_tells_what_was_refused(url: str, settings: StoreSettings, t
 
 
 @pytest.mark.long('processes that are killed')
-def test_a_process_that_is_killed_goes_on(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_a_killed_run_resumes(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """The command, killed at its first, second, ... request; then it ends, and everything is there once."""
     assert settings.directory is not None
     home = tmp_path / 'home'

@@ -125,7 +125,7 @@ def test_an_authority_is_no_server(
     assert front.inside.heard == b''
 
 
-def test_a_bundle_that_is_none_is_bad_usage(
+def test_an_invalid_ca_bundle_is_a_usage_error(
     towards: Callable[[str], StoreSettings], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """It is reported before any request."""

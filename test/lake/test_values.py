@@ -242,7 +242,7 @@ def test_fields_beyond_the_bound_are_unknown(tmp_path: Path) -> None:
     's.a >', 's.a > x', 'max(s.a > 1', 's.a > 1 and', '(s.a > 1', 's.a > 1 t.b > 2', 's.a > 1 and t.b > 2', 's.a', '(' * 99,
     ' or '.join(['s.a > 1'] * 33), '(' + ' or '.join(['(s.a > 1 or s.a > 2)'] * 20) + ')', 's.a > ' + '1' * 10_000,
 ])  # fmt: skip
-def test_what_is_no_condition_is_told(text: str) -> None:
+def test_an_invalid_condition_is_reported(text: str) -> None:
     """With what is allowed instead."""
     with pytest.raises(SettingError, match='when') as refused:
         values.parse(text)
@@ -256,8 +256,8 @@ LIES: list[dict[str, Any]] = [
 ]  # fmt: skip
 
 
-def test_statistics_that_contradict_themselves_are_told(tmp_path: Path) -> None:
-    """Their object is as one without statistics, never one without the field, and the others are evaluate as ever."""
+def test_inconsistent_statistics_are_reported(tmp_path: Path) -> None:
+    """Their object is as one without statistics, never one without the field, and the others are evaluated as usual."""
     source = filled(tmp_path, [BATCHES[-1]] * (len(LIES) + 3), [True] * (len(LIES) + 3))
     first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))
     second.unlink()
@@ -287,7 +287,7 @@ def test_absurd_counts_of_messages_hide_nothing(tmp_path: Path) -> None:
     assert values.ranges('s.b > 12', source, findings=left_out).unknown == 4
 
 
-def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
+def test_hostile_statistics_are_ignored(tmp_path: Path) -> None:
     """An invalid file, and rows of another robot, are reported; their objects are unknown, not absent."""
     source = filled(tmp_path, BATCHES, [True] * 10)
     for number, path in enumerate(sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))):

@@ -239,7 +239,7 @@ def test_a_table_of_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     asyncio.run(run())
 
 
-def test_the_node_is_told_of_each_act_whose_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_act_names_its_operator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The operator and the address, for its log and for the manifest of an event; the page cannot say another name."""
     asked: list[tuple[str, dict[str, str]]] = []
 
@@ -297,7 +297,7 @@ class Door:
         return not self.access.wait_s(address) and self.access.sign_in(token, address) is not None
 
 
-def test_strangers_lock_out_nobody_but_themselves(tmp_path: Path) -> None:
+def test_strangers_lock_out_only_themselves(tmp_path: Path) -> None:
     """Wrong tokens of many addresses, one a second and for an hour, do not keep the operator from signing in."""
     door = Door(tmp_path)
     for second in range(3600):
@@ -350,7 +350,7 @@ def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, mon
 
 
 @pytest.mark.parametrize('bind', ['0.0.0.0', '127.0.0.1'])
-def test_a_sign_in_ends_the_one_whose_cookie_comes_with_it(bind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sign_in_replaces_the_previous_cookie(bind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Wherever that cookie was copied to, also after the page restarts; a wrong token ends nothing, nor does a forged cookie."""
     monkeypatch.setattr(module, 'CHECK_S', 0.05)
     right, wrong = (json.dumps({'token': token}).encode() for token in ('{}', 'x' * 30))
@@ -410,7 +410,7 @@ def test_a_sign_in_is_not_refused_where_the_disk_does_not_keep_the_end_of_anothe
     asyncio.run(run())
 
 
-def test_a_sign_out_ends_the_connections_of_its_own_sign_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sign_out_ends_its_connections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All tabs of that browser, immediately; those of another sign-in with the same token continue."""
     monkeypatch.setattr(module, 'CHECK_S', 3600.0)  # nobody else looks who may watch
 
@@ -452,7 +452,7 @@ def test_a_sign_out_outlasts_a_restart(tmp_path: Path, monkeypatch: pytest.Monke
     asyncio.run(run())
 
 
-def test_a_sign_out_that_the_disk_refuses_is_told(
+def test_a_sign_out_that_cannot_be_stored_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It holds until the page restarts; whoever signs out and the log are told that it does not for longer."""
@@ -524,7 +524,7 @@ def test_who_needs_no_token_watches_on_whatever_becomes_of_the_tokens(tmp_path: 
     asyncio.run(run())
 
 
-def test_on_the_loopback_whoever_is_there_may_watch_and_not_act(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_loopback_viewers_need_no_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Acting needs the token of the operator everywhere."""
 
     async def run() -> None:
@@ -629,7 +629,7 @@ def test_a_viewer_that_chooses_again_and_again_changes_what_is_read_seldom(
     asyncio.run(run())
 
 
-def test_whoever_asks_for_nothing_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_connections_block_no_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Connections that never say what they want, or say it for ever, go; a viewer stays, and others are answered."""
     monkeypatch.setattr(module, 'MAX_CONNECTIONS', 8)
 
@@ -674,7 +674,7 @@ def test_a_token_that_others_know_is_refused(tmp_path: Path, mode: int, text: st
         make_tokens(tmp_path)
 
 
-def test_a_cookie_says_what_its_token_signed(tmp_path: Path) -> None:
+def test_a_forged_cookie_is_rejected(tmp_path: Path) -> None:
     """Another role, a later end, or nothing that is a cookie: nobody."""
     now = [1000.0]
     access = Access(make_tokens(tmp_path), is_open=False, now=lambda: now[0])
@@ -818,7 +818,7 @@ def test_a_clock_that_was_ahead_makes_no_cookie_for_years(tmp_path: Path) -> Non
     lambda content: content[:0], lambda content: content[:-9], lambda content: content + b'\n', lambda content: b'\xff' + content,
     lambda content: content[:-5] + bytes([content[-5] ^ 1]) + content[-4:], lambda content: content.replace(b'1', b'2'),
 ], ids=['empty', 'cut', 'longer', 'noise', 'a bit of a nonce', 'other times'])  # fmt: skip
-def test_damage_lets_nobody_in_and_locks_nobody_out(
+def test_a_damaged_file_ends_sign_ins_but_allows_new_ones(
     tmp_path: Path, damage: Callable[[bytes], bytes], caplog: pytest.LogCaptureFixture
 ) -> None:
     """It could have named anybody: all sign in again, at once and with the same tokens, and the log says why, once."""
@@ -836,7 +836,7 @@ def test_damage_lets_nobody_in_and_locks_nobody_out(
     assert 'sign in again with the token' in caplog.text
 
 
-def test_a_sign_in_of_a_role_whose_token_is_good_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_sign_in_continues_while_its_token_is_valid(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The other role's file may be read by others: it lets nobody in, which the log says once."""
     it = Signing(tmp_path)
     access = it.access()

@@ -108,7 +108,7 @@ def test_gps_is_exact(page: Page) -> None:
     assert abs(((latitude - LATITUDE) / 9e-6 / 2) ** 2 + ((longitude - LONGITUDE) / 1.3e-5 / 3) ** 2 - 1) < 0.1
 
 
-def test_what_the_model_lacks_is_said_in_its_place(page: Page) -> None:
+def test_missing_parts_of_the_model_are_named(page: Page) -> None:
     """Its meshes are files on the robot."""
     until(lambda: 'meshes are files on the robot' in ' '.join(page.locator('[data-note]').all_inner_texts()), 'the note')
 
@@ -125,7 +125,7 @@ def test_texts_of_the_robot_are_text(page: Page) -> None:
     assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
 
 
-def test_a_topic_that_nobody_publishes_comes_last_and_says_so(page: Page) -> None:
+def test_an_unpublished_topic_is_listed_last(page: Page) -> None:
     """The node subscribes to those of a Go2. Of more than 500 topics none is cut that has a publisher, and any can be found."""
     page.get_by_label('Search topics and types').fill('')
     holds(page, 'document.querySelectorAll("[data-inspect]").length > 50')
@@ -165,7 +165,7 @@ def test_a_number_of_a_message_is_plotted(page: Page, watching: Watching) -> Non
     inspect(page, '/wheel/speed')
 
 
-def test_cameras_are_beside_each_other_and_distances_have_a_scale(page: Page) -> None:
+def test_cameras_are_side_by_side_and_depth_has_a_scale(page: Page) -> None:
     """Up to all that there are; the scale has its unit."""
     for count in (1, 2):
         press(page.get_by_label('Another camera beside this one'))

@@ -406,7 +406,7 @@ def test_labels_are_marks_and_an_operator_adds_them(store: ObjectStore, opened: 
             history.answer({**given, **wrong})
 
 
-def test_what_the_robot_keeps_is_shown_and_asked_for(store: ObjectStore, opened: Opened, tmp_path: Path,
+def test_kept_data_is_shown_and_requested(store: ObjectStore, opened: Opened, tmp_path: Path,
                                                      monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """By the store: how much of a time is on the robot alone, a request for it, its states, and taking one back."""
     monkeypatch.setattr(kept_module, 'FRESH_S', -1.0)
@@ -468,7 +468,7 @@ def test_what_a_spool_keeps_is_asked_of_its_node(store: ObjectStore, opened: Ope
         assert history.answer({'do': 'kept', **span})[0]['kept'] == {}
 
 
-def test_a_store_that_is_away_delays_no_timeline(opened: Opened, store: ObjectStore, tmp_path: Path,
+def test_an_unreachable_store_delays_no_timeline(opened: Opened, store: ObjectStore, tmp_path: Path,
                                                  monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """The rest is shown, and that the labels are still being read."""
     patrol(store, tmp_path)
@@ -495,7 +495,7 @@ def test_what_is_no_question_is_refused(opened: Opened, question: dict[str, Any]
 
 
 @pytest.mark.long('processes that read the past')
-def test_the_process_ends_when_nobody_asks_and_comes_again(store: ObjectStore, tmp_path: Path) -> None:
+def test_the_idle_process_exits_and_restarts(store: ObjectStore, tmp_path: Path) -> None:
     """After an idle while, after a kill, and after a question that took too long."""
     patrol(store, tmp_path)
 

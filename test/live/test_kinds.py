@@ -82,7 +82,7 @@ def test_points_come_back_within_half_a_step() -> None:
 
 
 @pytest.mark.filterwarnings('error')
-def test_points_that_are_absurdly_far_are_left_out() -> None:
+def test_absurdly_far_points_are_removed() -> None:
     """They would make all others one point."""
     points = np.zeros((100, 3))
     points[:4] = [[1e30, 0, 0], [0, -3.4e38, 3.4e38], [np.inf, -np.inf, np.nan], [5.0, 6.0, 7.0]]
@@ -117,7 +117,7 @@ def test_a_raw_image_becomes_a_jpeg_of_each_size(encoding: str, channels: int) -
 
 
 @pytest.mark.parametrize('kind', ['', 'jpeg', 'bgr8; jpeg compressed bgr8'])
-def test_a_compressed_image_goes_as_it_came(kind: str) -> None:
+def test_a_compressed_image_is_sent_unchanged(kind: str) -> None:
     """Only a smaller one is made of it; what its format is called moves the rest."""
     jpeg = simplejpeg.encode_jpeg(np.zeros((480, 640, 3), np.uint8), 80, 'BGR')
     message = new(COMPRESSED_IMAGE, header=header(), format=kind, data=np.frombuffer(jpeg, np.uint8))

@@ -330,7 +330,7 @@ def test_the_page_takes_no_shared_memory_for_images(watching: Watching) -> None:
     assert sum(path.stat().st_size for path in segments) < 1 << 20
 
 
-def test_after_a_kill_the_page_goes_on_by_itself(page: Page, watching: Watching) -> None:
+def test_after_a_kill_the_page_reconnects(page: Page, watching: Watching) -> None:
     """Without a reload and without a new sign-in; meanwhile everything is marked as old, and the ages go on growing."""
     port = int(watching.url.rstrip('/').rpartition(':')[2])
     watching.live.signal(signal.SIGKILL)
@@ -405,7 +405,7 @@ def most_of(found: list[float]) -> float:
     return sorted(found)[len(found) * 19 // 20]
 
 
-def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching) -> None:
+def test_a_gap_is_on_the_timeline_at_its_time(page: Page, watching: Watching) -> None:
     """What was published while the node was away, by the cause restart, and whatever else ``ledger --gaps`` tells."""
     watching.sim = watching.processes.sim(RATES)
     received = watching.node.topic('/imu')['received']
@@ -778,7 +778,7 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
         served.close()
 
 
-def test_what_waits_says_for_which_rule_and_how_long(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_uploads_name_their_rule_and_duration(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the node's status has it: the rule and why it does not hold, or when all of it will have arrived."""
     spool, clock = tmp_path / 'spool', SystemClock.of_this_machine()
     served = Served(LiveSettings(spool=spool, robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
@@ -903,7 +903,7 @@ def minute(store: ObjectStore, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_played_is_asked_for_ahead(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_playback_reads_ahead(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a recorded minute some six moments a second are shown at its own pace, though each takes 0.08 s more to be read."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)

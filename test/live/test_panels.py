@@ -155,7 +155,7 @@ def test_a_log_has_its_last_lines() -> None:
     assert rows[-1][1:] == [40, 'nav', 'line 149']
 
 
-def test_a_description_is_sent_as_it_is() -> None:
+def test_a_robot_description_is_sent_unchanged() -> None:
     """Of a topic with that name alone, and not of any size."""
     assert made('/robot_description', STRING, new(STRING, data='<robot/>')).body == b'<robot/>'
     assert panel_of('/chatter', STRING) is None

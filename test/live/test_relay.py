@@ -181,7 +181,7 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
 @pytest.mark.parametrize(('path', 'status', 'why'), [
     ('/api/session', 429, 'too many wrong tokens'), ('/ws', 401, 'requires a token'), ('/ws', 429, 'no more viewers'),
 ])  # fmt: skip
-def test_a_robot_that_lets_nobody_in_is_left_alone_for_a_while(
+def test_a_rejecting_robot_is_retried_later(
     path: str, status: int, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whether too many came from here, it wants a token and we have none, or it has as many viewers as it takes."""
@@ -243,7 +243,7 @@ def test_a_robot_that_ends_each_connection_is_asked_again_after_a_pause(tmp_path
     asyncio.run(run())
 
 
-def test_who_comes_while_the_relay_leaves_is_shown_the_robot_at_once() -> None:
+def test_a_viewer_during_disconnect_sees_the_robot_immediately() -> None:
     """As who loads the page of Tower anew: that the robot answers the end of a connection that nobody needed is no fault."""
     came: list[float] = []
     told: list[Any] = []
@@ -305,9 +305,7 @@ PONG = WHOLE + LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed
     WHOLE + LiveItem('/a', 'camera', head={'at': 1.0}, body=b'no jpeg').packed,
     WHOLE + LiveItem('/a', 'camera', head={'at': 1.0}, body=of_too_many_pixels()).packed,
 ])  # fmt: skip
-def test_a_robot_that_says_nonsense_is_said_to_be_unreadable(
-    tmp_path: Path, said: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_invalid_robot_page_is_reported(tmp_path: Path, said: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     """The page of the store goes on, and says why there is no live view."""
     monkeypatch.setattr('shadowhound_data_logger.live.relay.AGAIN_S', 0.01)
 

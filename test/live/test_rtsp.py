@@ -52,7 +52,7 @@ def progressive() -> bytes:
     (jpeg(480, 640), ''), (jpeg(480, 640, '422'), ''), (jpeg(8, 2040), ''), (jpeg(480, 640, '444'), '444'),
     (jpeg(481, 640), '481'), (jpeg(8, 2048), '2048'), (b'', 'not a JPEG'), (progressive(), 'baseline'),
 ])  # fmt: skip
-def test_what_rfc_2435_cannot_send_is_said(picture: bytes, word: str) -> None:
+def test_jpegs_unsupported_by_rfc_2435_are_reported(picture: bytes, word: str) -> None:
     """Sizes, sampling and coding of a JPEG decide."""
     assert word in unsuited(picture)
     assert bool(word) is bool(unsuited(picture))
@@ -69,7 +69,7 @@ def test_the_password_is_in_a_file_of_its_owner(tmp_path: Path) -> None:
     assert rtsp_password(tmp_path) != first
 
 
-def test_a_machine_without_gstreamer_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_gstreamer_has_a_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Whether there is no Python of the system, or one without bindings."""
 
     async def run() -> str:
@@ -171,7 +171,7 @@ def tos_of_packets(url: str, password: str, count: int) -> tuple[str, set[int]]:
 
 
 @pytest.mark.long("GStreamer's RTSP server")
-def test_only_who_has_the_password_is_told_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rtsp_requires_the_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without any it is 401, as with a wrong one; packets are marked as interactive video (AF41)."""
     if not has_gstreamer():
         pytest.skip(f'no GStreamer is installed here: {INSTALL}')

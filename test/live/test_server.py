@@ -52,7 +52,7 @@ async def watched(server: LiveServer, items: list[LiveItem]) -> list[tuple[str, 
     return found
 
 
-def test_items_of_every_size_arrive_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_items_of_every_size_arrive_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """However RFC 6455 tells their length, small ones first, large ones as the viewer acknowledges them."""
     monkeypatch.setattr(module, 'find_spec', lambda _: None)  # no ROS here
     small = [LiveItem('/small', 'imu', FULL, {'number': size}, bytes([size % 251]) * size) for size in (0, 60, 500, 70_000)]
@@ -149,7 +149,7 @@ def test_video_is_suggested_to_who_has_had_a_narrow_link_for_a_while(tmp_path: P
     assert suggested(3 * NARROW_S, narrow=True) == 0
 
 
-def test_a_page_on_a_narrow_link_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_on_a_narrow_link_is_notified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It gets frames that the link does not carry in full, and after a while the word."""
     monkeypatch.setattr(module, 'FIGURES_S', 0.05)
     monkeypatch.setattr(viewers_module, 'NARROW_S', 0.3)
@@ -174,7 +174,7 @@ def test_a_page_on_a_narrow_link_is_told_so(tmp_path: Path, monkeypatch: pytest.
     assert asyncio.run(run()) == {'topic': '', 'kind': 'video', 'narrow': True}
 
 
-def test_figures_say_what_uploads_wait_for(tmp_path: Path) -> None:
+def test_status_shows_what_uploads_wait_for(tmp_path: Path) -> None:
     """The rule and why it does not hold, and how long it takes until all has arrived, as the node's status has them."""
     said = {'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}, 'left_s': 754}
     written(tmp_path, store={'state': 'waiting', **said})
@@ -182,7 +182,7 @@ def test_figures_say_what_uploads_wait_for(tmp_path: Path) -> None:
     assert {name: store[name] for name in said} == said
 
 
-def test_a_task_that_fails_is_told_of_at_once(
+def test_a_failed_task_is_logged_immediately(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Nobody would notice that connections no longer end with their sign-in."""
@@ -226,7 +226,7 @@ def test_the_round_trip_to_each_viewer_is_known(is_of_store: bool, tmp_path: Pat
     asyncio.run(asyncio.wait_for(run(), 30.0))
 
 
-def test_who_acknowledges_what_he_does_not_read_gets_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_false_acknowledgments_gain_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What waits for him in this process is bounded."""
 
     async def run() -> None:
@@ -258,7 +258,7 @@ def test_who_acknowledges_what_he_does_not_read_gets_no_more(tmp_path: Path, mon
     asyncio.run(asyncio.wait_for(run(), 30.0))
 
 
-def test_memory_is_trimmed_once_nobody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_trimmed_without_viewers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not while somebody does, and not again while nobody comes."""
     trimmed: list[int] = []
 

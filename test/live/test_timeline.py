@@ -137,7 +137,7 @@ def test_it_opens_at_the_data_and_zooms_and_pans(page: Page) -> None:
 
 
 @in_chromium
-def test_a_gap_is_shown_and_told_in_words(page: Page) -> None:
+def test_a_gap_is_drawn_and_described(page: Page) -> None:
     """A click goes to the last message before it: what was lost, why, what to do; jumps go there too; hostile causes are text."""
     gap = page.locator('rect.gap[data-topic="/imu"]').bounding_box()
     assert gap is not None
@@ -224,7 +224,7 @@ def test_a_selection_offers_its_commands_and_a_piece_of_the_bag(page: Page, tmp_
 
 
 @in_chromium
-def test_losses_are_shown_until_somebody_has_seen_them(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_losses_are_shown_until_acknowledged(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the last day, or since they were acknowledged, which this browser keeps; the row of the topic is no alarm any more."""
     now_ms = time.time() * 1e3
     columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']

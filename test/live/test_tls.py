@@ -108,7 +108,7 @@ def test_plain_http_gets_nothing_from_that_port(
     asyncio.run(run())
 
 
-def test_a_relay_gives_its_token_to_nobody_whom_it_cannot_trust(
+def test_a_relay_sends_its_token_only_to_a_trusted_server(
     tmp_path: Path, authorities: dict[str, Authority], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The page of the store says that it is the certificate, and goes on."""

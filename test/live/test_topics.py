@@ -130,7 +130,7 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, doing: Callable[[Robot], 
         asyncio.run(with_robot())
 
 
-def test_a_topic_is_read_once_and_only_while_somebody_watches_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_topic_is_read_once_and_only_while_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the publishers see it: no subscription before, one however many watch, none once the last tab hides or leaves."""
 
     async def doing(found: Robot) -> None:

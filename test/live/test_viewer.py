@@ -257,7 +257,7 @@ def test_a_narrow_link_is_not_filled_beyond_what_it_holds(now: list[float], rate
     assert late[int(len(late) * 0.95)] < round_s / 2 + (MIN_QUEUE + 2 * 4_096) / rate + 0.08
 
 
-def test_beside_video_large_items_get_a_part_of_the_link(now: list[float]) -> None:
+def test_with_video_large_items_get_a_share_of_the_link(now: list[float]) -> None:
     """Of the link as it was before: what goes beside video tells nothing of it. Rows wait for no more than that part of a way."""
     viewer = Viewer(lambda: now[0])
     viewer.round_s = 0.1
@@ -290,7 +290,7 @@ def test_a_piece_of_a_large_item_does_not_keep_a_link_for_long(browser: Browser,
     assert len(sent) == chunk + 4
 
 
-def test_beside_video_a_piece_of_a_large_item_is_as_long_as_its_part_of_the_link(browser: Browser) -> None:
+def test_with_video_frames_of_large_items_are_sized_by_their_share(browser: Browser) -> None:
     """Not as the whole link: rows and video would wait for it."""
     browser.viewer.rate, browser.viewer.has_video = 4e6, True
     browser.viewer.offer(frame(1))
@@ -312,7 +312,7 @@ def test_small_items_go_while_a_window_is_full(browser: Browser) -> None:
     assert browser.received - before <= SMALL_ROOM + SMALL_FRAME
 
 
-def test_a_way_is_not_believed_to_hold_what_none_holds(now: list[float]) -> None:
+def test_an_implausible_link_rate_is_not_trusted(now: list[float]) -> None:
     """A kernel, or who stands in between, may say anything."""
     viewer = Viewer(lambda: now[0])
     viewer.rate, viewer.round_s = 1e12, 1e6

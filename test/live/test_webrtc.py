@@ -143,7 +143,7 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
-def test_a_page_without_the_extra_shows_jpegs_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_page_shows_jpegs_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the extra is there and the negotiation fails."""
     api = pytest.importorskip('playwright.async_api')
 
@@ -288,7 +288,7 @@ def test_an_offer_gives_ports_and_no_addresses(end: str) -> None:
     OFFER.replace('a=ice-pwd:', 'a=nothing:'), OFFER.replace('a=fingerprint:', 'a=none:'), OFFER.replace('SAVPF 96', 'SAVPF x'),
     'm=video \ud800', OFFER.replace('a=setup:actpass', 'a=setup:nobody'), 7, None, ['m=video 9'],
 ])  # fmt: skip
-def test_an_offer_that_is_none_is_answered_with_the_problem(offer: Any) -> None:
+def test_an_invalid_offer_is_answered_with_the_problem(offer: Any) -> None:
     """And leaves nothing behind."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
 
@@ -305,7 +305,7 @@ def test_an_offer_that_is_none_is_answered_with_the_problem(offer: Any) -> None:
     asyncio.run(run())
 
 
-def test_no_more_peers_and_cameras_than_there_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peers_and_cameras_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes later is told so; whoever goes makes room."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     monkeypatch.setattr(webrtc, 'MAX_PEERS', 3)

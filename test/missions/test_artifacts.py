@@ -249,7 +249,7 @@ def test_a_server_that_takes_nothing_is_not_believed(folder: MissionFolder) -> N
     assert set(tracking.artifacts) == OTHERS | {'bad'}
 
 
-def test_a_restart_in_between_loses_none(folder: MissionFolder) -> None:
+def test_a_restart_in_between_loses_nothing(folder: MissionFolder) -> None:
     """Artifacts that wait behind others do not count as sent."""
     tracking = Picky(lambda name: name != 'bad', lambda: TrackingUnavailable('500', remedy=''))
     deliver(folder, tracking, 20)

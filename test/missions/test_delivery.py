@@ -86,7 +86,7 @@ def test_everything_arrives_in_order(tmp_path: Path) -> None:
     assert not folder.files.exists()
 
 
-def test_the_summary_tells_the_mission(tmp_path: Path) -> None:
+def test_the_summary_describes_the_mission(tmp_path: Path) -> None:
     """Its times, result, errors, counts and where its data are; the same in the run and in the store."""
     folder = fly(tmp_path)
     tracking, spooler = FakeTracking(), FakeSpooler()
@@ -272,7 +272,7 @@ def test_a_measured_distance_replaces_a_stated_zero(tmp_path: Path) -> None:
         assert summary['duration_s'] > 0
 
 
-def test_a_frame_that_is_gone_is_counted(tmp_path: Path) -> None:
+def test_a_missing_frame_is_counted(tmp_path: Path) -> None:
     """In the report, in the summary's ledger, and nowhere as an object; what is not gone arrives."""
     folder = fly(tmp_path, frames=3)
     [gone] = (file for file in folder.files.iterdir() if file.read_bytes() == JPEG + bytes([1]))

@@ -163,7 +163,7 @@ def test_syncing_does_not_hold_up_writers(journal: Journal, monkeypatch: pytest.
         thread.join()
 
 
-def test_nobody_else_reads_it(journal: Journal) -> None:
+def test_other_users_cannot_read_the_journal(journal: Journal) -> None:
     """Only the owner can read what a robot did."""
     assert journal.path.stat().st_mode & 0o077 == 0
 

@@ -56,7 +56,7 @@ def test_a_fork_touches_no_file_of_the_mission(tmp_path: Path) -> None:
     assert [path.read_bytes() for path in files.iterdir()] == [JPEG]
 
 
-def test_what_comes_after_the_end_leaves_no_file(tmp_path: Path) -> None:
+def test_calls_after_the_end_write_no_file(tmp_path: Path) -> None:
     """It would never be sent."""
     with journalling(tmp_path) as logger:
         with logger.mission('patrol', '') as mission:
@@ -77,13 +77,13 @@ def test_closing_ends_the_mission_as_killed(tmp_path: Path, caplog: pytest.LogCa
     assert logging.WARNING in {record.levelno for record in caplog.records}
 
 
-def test_a_robot_s_name_is_checked_at_once(tmp_path: Path) -> None:
+def test_a_robot_name_is_checked_immediately(tmp_path: Path) -> None:
     """The constructor refuses a name that cannot be the first part of a key, before any mission."""
     with pytest.raises(SettingError, match='robot'):
         MissionDataLogger(robot='../thor', home=tmp_path, replay=False)
 
 
-def test_a_home_of_nobody_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_home_is_rejected_immediately(monkeypatch: pytest.MonkeyPatch) -> None:
     """As the node refuses it: a user without a home, in a container say, has to name the folder."""
     monkeypatch.setenv('SHADOWHOUND_HOME', '~no-such-user/x')
     with pytest.raises(SettingError, match='SHADOWHOUND_HOME'):

@@ -235,7 +235,7 @@ def test_a_file_that_a_proxy_never_takes_is_refused(server: Server, tmp_path: Pa
 
 
 @pytest.mark.parametrize('mode', [REFUSE, HANG, (200, 'Portal'), (403, 'Forbidden'), (500, 'Broken'), (404, 'Elsewhere')])
-def test_a_server_that_is_none_is_tried_again(server: Server, mode: str | tuple[int, str]) -> None:
+def test_an_invalid_server_is_retried(server: Server, mode: str | tuple[int, str]) -> None:
     """Whatever answers, or does not: the mission waits, and the error has a remedy and no password."""
     server.wire.set(mode)
     tracking = MlflowTracking(server.wire.url.replace('//', '//thor:very@secret@'), 'thor_missions')

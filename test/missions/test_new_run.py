@@ -130,7 +130,7 @@ def test_an_experiment_is_created_once(server: Server, home: Path, tmp_path: Pat
 
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('mode', [REFUSE, (200, 'Portal'), (503, 'Broken')])
-def test_without_a_server_the_mission_starts_at_once(server: Server, home: Path, mode: str | tuple[int, str]) -> None:
+def test_without_a_server_the_mission_starts_immediately(server: Server, home: Path, mode: str | tuple[int, str]) -> None:
     """It has its own id, and starts as soon as the server is known to be unreachable."""
     server.wire.set(mode)
     logger = MissionDataLogger(home=home, start_timeout_s=1.0)

@@ -102,7 +102,7 @@ def test_without_a_node_it_is_delivered(tmp_path: Path, spooler: Spooler, folder
         assert free
 
 
-def test_beside_a_node_it_is_the_node_s(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
+def test_with_a_node_running_the_node_delivers(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """The process that drains the spool delivers it."""
     spooler.add(objects(folder, RUN))
     with flock(tmp_path / 'spool' / 'drain.lock', wait=False):
@@ -141,7 +141,7 @@ def test_a_node_s_larger_spool_is_left_to_it(tmp_path: Path, folder: MissionFold
     assert set(spooled(tmp_path).values()) == {'pending'}
 
 
-def test_an_index_that_is_lost_meanwhile(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
+def test_an_index_that_is_lost_during_delivery(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """The objects that come then are refused once, and taken when they are handed over again."""
     first, *others = objects(folder, RUN)
     spooler.add([first])

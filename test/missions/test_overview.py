@@ -118,7 +118,7 @@ def test_a_complete_mission_waits_for_nothing(folder: MissionFolder) -> None:
     assert (found.complete, found.waiting_for, found.remedy, found.refused, found.last_error) == (True, '', '', 1, 'no')
 
 
-def test_a_journal_that_is_gone(folder: MissionFolder) -> None:
+def test_a_missing_journal(folder: MissionFolder) -> None:
     """The report says so, and does not raise."""
     folder.journal.unlink()
     assert 'missing' in said(folder).waiting_for

@@ -34,7 +34,7 @@ def test_a_batch_is_a_window_of_utc() -> None:
     assert not len(open_batch)
 
 
-def test_a_batch_says_what_it_is() -> None:
+def test_a_batch_has_sensor_topic_and_type() -> None:
     """Sensor, topic, type and the bytes of CDR stand on it."""
     open_batch = batcher()
     open_batch.add(Sample(1, b'12345'), 0.0)

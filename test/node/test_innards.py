@@ -54,7 +54,7 @@ def test_a_subscription_is_taken_from(node: Any) -> None:
     node.destroy_subscription(subscription)
 
 
-def test_events_are_left_out_where_nobody_asked_for_them(node: Any) -> None:
+def test_event_handlers_are_off_by_default(node: Any) -> None:
     """A subscription that wants none has none: they would be in the wait set."""
     silent = SubscriptionEventCallbacks(use_default_callbacks=False)
     subscription = node.create_subscription(String, '/silent', never, 5, callback_group=PolledGroup(), event_callbacks=silent)
@@ -77,6 +77,6 @@ def test_a_group_answers_all_that_an_executor_asks_of_it(node: Any) -> None:
 
 
 @pytest.mark.skipif(rclpy.get_rmw_implementation_identifier() != 'rmw_fastrtps_cpp', reason='the layout is used with Fast DDS')
-def test_the_layout_of_what_librcl_tells(node: Any) -> None:
+def test_librcl_is_verified_on_this_distribution(node: Any) -> None:
     """The proof of the start holds on this distribution, also where rclpy tells all and nobody needs it."""
     assert verify_librcl(node) == ''

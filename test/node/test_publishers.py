@@ -170,7 +170,7 @@ def test_what_a_transient_local_publisher_sent_before(listening: Listening) -> N
     assert listening.numbers('early_transient_local', COUNT) == list(range(COUNT))
 
 
-def test_a_history_beside_a_publisher_that_has_none(listening: Listening) -> None:
+def test_a_latched_and_a_volatile_publisher(listening: Listening) -> None:
     """The history of the one that is TRANSIENT_LOCAL and the messages of the one that is not are kept, and once."""
     listening.late.create(String, '/both')
     listening.heard(listening.late, '/both')

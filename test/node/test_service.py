@@ -25,7 +25,7 @@ def _environ(receiver: socket.socket, **more: str) -> dict[str, str]:
     return {'NOTIFY_SOCKET': str(receiver.getsockname()), **more}
 
 
-def test_it_says_that_it_is_ready_and_that_it_stops(systemd: socket.socket) -> None:
+def test_systemd_is_notified_of_ready_and_stopping(systemd: socket.socket) -> None:
     """Readiness comes with what it logs, and the end is announced."""
     service = SystemdService(_environ(systemd))
     service.ready('logging /odom')
@@ -34,7 +34,7 @@ def test_it_says_that_it_is_ready_and_that_it_stops(systemd: socket.socket) -> N
     assert systemd.recv(1000).startswith(b'STOPPING=1\n')
 
 
-def test_it_says_that_it_lives_a_few_times_an_interval(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watchdog_is_pinged_several_times_per_interval(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     """Turning the loop fifty times in two thirds of the interval is told three times."""
     now = 100.0
     monkeypatch.setattr('shadowhound_data_logger.node.node.time.monotonic', lambda: now)
@@ -50,7 +50,7 @@ def test_it_says_that_it_lives_a_few_times_an_interval(systemd: socket.socket, m
 
 
 @pytest.mark.parametrize('more', [{}, {'WATCHDOG_USEC': '30000000', 'WATCHDOG_PID': '1'}, {'WATCHDOG_USEC': 'soon'}])
-def test_it_is_quiet_where_nobody_watches(systemd: socket.socket, more: dict[str, str]) -> None:
+def test_without_a_watchdog_nothing_is_sent(systemd: socket.socket, more: dict[str, str]) -> None:
     """Without a watchdog, or with one of another process, nothing is sent."""
     service = SystemdService(_environ(systemd, **more))
     service.alive()
@@ -66,7 +66,7 @@ def test_its_children_do_not_speak_for_it(systemd: socket.socket) -> None:
     assert environ == {'HOME': '/root'}
 
 
-def test_systemd_away_is_no_failure(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unreachable_systemd_is_not_a_failure(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A socket that is gone is said once, and logging goes on; without systemd nothing is said at all."""
     service = SystemdService({'NOTIFY_SOCKET': str(tmp_path / 'gone')})
     service.ready('x')

@@ -423,7 +423,7 @@ def test_stolen_targets_and_online_keys(battle: Battle) -> None:
     assert battle.publish(3) == battle.taken()
 
 
-def test_a_stolen_targets_key_whose_list_a_refresh_took_in(battle: Battle) -> None:
+def test_a_stolen_targets_key_after_a_refresh(battle: Battle) -> None:
     """It was signed well, so robots take it; new keys list what was signed in the team's own folder, and no more."""
     thief = battle.stolen()
     first, evil = battle.folder.current(), thief.evil()

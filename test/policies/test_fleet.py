@@ -72,7 +72,7 @@ def speaker() -> Iterator[tuple[int, Callable[[str], object]]]:
         rclpy.try_shutdown(context=context)
 
 
-def test_a_service_ends_at_once_also_while_it_downloads(tower: Tower, tmp_path: Path) -> None:
+def test_a_service_stops_immediately_during_a_download(tower: Tower, tmp_path: Path) -> None:
     """A download of minutes blocks nothing, and continues with the bytes that have arrived."""
     bucket_of(tower)
     spark = Spark(tmp_path / 'spark', f'patrol_{uuid4().hex[:8]}')

@@ -47,7 +47,7 @@ def told_of(home: Path) -> list[tuple[MissionState, dict[str, Any]]]:
     return sorted(stories, key=lambda told: told[1]['start_ns'])
 
 
-def test_a_mission_says_which_policy_was_active(tmp_path: Path, logger: MissionDataLogger) -> None:
+def test_a_mission_records_the_active_policy(tmp_path: Path, logger: MissionDataLogger) -> None:
     """In the params of its run and in its summary; one that had none says none."""
     for name in (None, NEW):
         activate(tmp_path, name)
@@ -58,7 +58,7 @@ def test_a_mission_says_which_policy_was_active(tmp_path: Path, logger: MissionD
     assert told == [(None, None, None, None, []), (NEW, None, NEW, NEW, [])]
 
 
-def test_a_rollback_within_a_mission_is_in_all_that_is_said_of_it(tmp_path: Path, logger: MissionDataLogger) -> None:
+def test_a_rollback_during_a_mission_is_recorded(tmp_path: Path, logger: MissionDataLogger) -> None:
     """Both policies in their order and when it was; also where the agent logs nothing after it, and where none is left."""
     activate(tmp_path, NEW)
     logger.start_mission('patrol', 'go round')

@@ -98,7 +98,7 @@ def test_a_manifest_that_names_what_it_may_not(second: Scene, path: str, reason:
     lambda told: told.update(kind='torch'), lambda told: told.update(model='config.json'), lambda told: told.update(files={}),
     lambda told: told['inputs'][0].update(shape=[1 << 20, 1 << 20]), lambda told: told.update(smoke=[]),
 ])  # fmt: skip
-def test_a_manifest_that_is_none(second: Scene, change: Callable[[dict[str, Any]], object]) -> None:
+def test_an_invalid_manifest(second: Scene, change: Callable[[dict[str, Any]], object]) -> None:
     second.forge(2, change)
     assert second.refused() == 'manifest'
 
@@ -151,7 +151,7 @@ def test_a_registry_that_names_another_place(second: Scene, source: str) -> None
     assert second.refused() == 'source'
 
 
-def test_another_version_than_the_registry_says(second: Scene) -> None:
+def test_a_version_that_differs_from_the_registry(second: Scene) -> None:
     """In the place of version 2 is version 1, well signed."""
     second.sign(2, (second.place(1) / MANIFEST).read_bytes())
     assert second.refused() == 'source'
@@ -252,7 +252,7 @@ def _of(*nodes: onnx.NodeProto) -> onnx.ModelProto:
     ('m.safetensors', b'\xff' * 16),
     ('a.json', b'{'), ('a.json', b'[' * 100_000), ('a.npy', b'\x80\x04'), ('a.npy', b''),
 ])  # fmt: skip
-def test_a_file_that_is_not_what_its_name_says(tmp_path: Path, name: str, content: bytes) -> None:
+def test_a_file_with_a_wrong_extension(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(PolicyRefused) as raised:
         check_content(tmp_path / name, name)
@@ -292,7 +292,7 @@ def test_safetensors_as_the_library_writes_them(tmp_path: Path, header: object) 
     {'a': {'dtype': 'U8', 'shape': [1 << 62, 4, 1 << 62, 0], 'data_offsets': [0, 8]}},
     json.dumps({'a': {'dtype': 'F32', 'shape': [2], 'data_offsets': [0, 8]}}).encode() + b' ' * (2 << 20),
 ])  # fmt: skip
-def test_safetensors_that_are_none(tmp_path: Path, header: object) -> None:
+def test_invalid_safetensors(tmp_path: Path, header: object) -> None:
     """Another type, shape or place of a tensor than the format allows, overlaps and gaps, or a header of megabytes."""
     (tmp_path / 'm.safetensors').write_bytes(safetensors(header))
     with pytest.raises(PolicyRefused) as raised:
@@ -463,7 +463,7 @@ def test_no_rollback_waits_for_gigabytes(second: Scene, monkeypatch: pytest.Monk
     assert not any(held)
 
 
-def test_a_home_that_anybody_may_rename_things_in(second: Scene) -> None:
+def test_a_home_that_others_can_write_to(second: Scene) -> None:
     """He could put other keys into the place of ours; where only owners may rename, as in /tmp, he cannot."""
     home = second.path / 'thor'
     home.chmod(0o1777)
@@ -476,7 +476,7 @@ def test_a_home_that_anybody_may_rename_things_in(second: Scene) -> None:
 
 
 @pytest.mark.parametrize('name', ['stray', 'link', '{id}', '{id}/link.json', '{id}/stray', '{id}/smoke', '{id}/model.onnx.part/'])
-def test_what_lies_among_downloads_hinders_none(second: Scene, name: str) -> None:
+def test_stray_files_do_not_disturb_downloads(second: Scene, name: str) -> None:
     """Foreign files, links and folders are deleted, and the download continues."""
     manifest = parse_manifest((second.place(2) / MANIFEST).read_bytes())
     place = second.folder.versions.incoming / name.format(id=manifest.id)

@@ -176,7 +176,7 @@ def test_without_a_sandbox_nothing_is_run_unless_that_is_allowed(tmp_path: Path,
 
 @needs_bwrap
 @pytest.mark.long('a process that runs a model')
-def test_the_isolation_that_was_in_force_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_isolation_in_use_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A model runs in the sandbox, even if less is required; without one, ``limits`` is reported."""
     packed, manifest = Spark(tmp_path).packed(1)
     assert [run_smoke(packed, manifest, isolation=each).isolation for each in (SANDBOX, LIMITS)] == [SANDBOX, SANDBOX]

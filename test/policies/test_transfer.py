@@ -215,7 +215,7 @@ class Liar(DirectoryStore):
 
 
 @pytest.mark.parametrize(('breaks', 'error'), [(True, StoreUnavailable), (False, PolicyRefused)])
-def test_a_store_that_lies_costs_a_bounded_transfer(
+def test_a_lying_store_causes_a_bounded_transfer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, breaks: bool, error: type[Exception]
 ) -> None:
     """One that sends something else, and whenever it was found out breaks off before the second time."""

@@ -130,7 +130,7 @@ def test_a_single_publisher_is_the_sender() -> None:
     assert senders.name(None, 50) is None
 
 
-def test_a_successor_is_told_from_its_predecessor() -> None:
+def test_a_successor_is_distinguished_from_its_predecessor() -> None:
     """Numbers that begin anew while time goes on are another publisher's, though the graph does not show it yet."""
     senders = Senders()
     senders.poll(['a'])

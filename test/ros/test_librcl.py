@@ -72,7 +72,7 @@ def drained(found: Reader, count: int) -> list[Taken]:
 
 @needs_fast_dds
 @pytest.mark.parametrize('latched', [False, True])
-def test_librcl_and_rclpy_tell_the_same(node: Any, monkeypatch: pytest.MonkeyPatch, *, latched: bool) -> None:
+def test_librcl_and_rclpy_agree(node: Any, monkeypatch: pytest.MonkeyPatch, *, latched: bool) -> None:
     """Of each message of two publishers, small, large and small again: bytes, times, and what rclpy tells of who sent it."""
     monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', ())
     by_rclpy = read(node, '/both', latched=latched)
@@ -129,7 +129,7 @@ def test_who_needs_librcl(node: Any, monkeypatch: pytest.MonkeyPatch, version: t
 
 
 @needs_fast_dds
-def test_this_rclpy_tells_what_its_version_says(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rclpy_reports_what_its_version_should(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether a take through it names the publisher, which the bound rests on."""
     with monkeypatch.context() as patch:
         patch.setattr(reader, 'REPORTS_PUBLISHERS', ())
@@ -144,7 +144,7 @@ def test_this_rclpy_tells_what_its_version_says(node: Any, monkeypatch: pytest.M
 
 @needs_fast_dds
 @pytest.mark.parametrize('version', [(), (99,)])
-def test_an_empty_message_is_none(
+def test_an_empty_message_is_skipped(
     node: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, version: tuple[int, ...]
 ) -> None:
     """Fast DDS gives one without end where it lost its place: the reader goes on with another subscription, and says so once."""
@@ -235,7 +235,7 @@ WRONG = {
 @needs_fast_dds
 @pytest.mark.usefixtures('through_librcl')
 @pytest.mark.parametrize('what', WRONG)
-def test_what_is_told_wrong_is_not_trusted(
+def test_incorrect_message_info_is_not_trusted(
     node: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """Messages are taken through rclpy then, and one warning says why."""
@@ -286,7 +286,7 @@ def test_what_the_history_overwrote_is_a_gap_in_the_numbers(node: Any) -> None:
     found.close()
 
 
-def test_a_subscription_that_is_none_is_an_error() -> None:
+def test_an_invalid_subscription_is_an_error() -> None:
     """Not a count."""
     nothing = ctypes.create_string_buffer(64)
     for _ in range(2):

@@ -67,7 +67,7 @@ def listener(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Listener]
     rclpy.try_shutdown(context=context)
 
 
-def test_a_policy_is_told_judged_and_sent_out(scene: Scene, listener: Listener) -> None:
+def test_a_policy_is_published_evaluated_and_rolled_back(scene: Scene, listener: Listener) -> None:
     first, second = scene.folder.versions.ids()
     with serve_policy_topics(scene.folder) as topics:
         listener.until(lambda: listener.heard, 'a node that comes later hears it too')

@@ -135,7 +135,7 @@ def test_what_is_no_port_of_ours_is_left_alone(
 
 
 @pytest.mark.parametrize(('data', 'told'), [(b'', b'\0'), (bytes(52400), b'\3\0\0\0'), (b'\1'.ljust(52400, b'\0'), b'\3\0\0\0')])
-def test_a_port_that_nobody_finishes_is_given_up(shm: Path, data: bytes, told: bytes) -> None:
+def test_an_unfinished_port_is_abandoned(shm: Path, data: bytes, told: bytes) -> None:
     """Who waits for it sees that it is damaged, and the next one makes another."""
     path = leave(shm)
     path.write_bytes(data)
@@ -238,7 +238,7 @@ def pair(tmp_path: Path) -> Iterator[Callable[[bool], Pair]]:
 
 @pytest.mark.ros
 @pytest.mark.long('a kill')
-def test_a_publisher_that_stands_still_goes_on(pair: Callable[[bool], Pair]) -> None:
+def test_a_blocked_publisher_continues(pair: Callable[[bool], Pair]) -> None:
     """It does stand still without; should that fail, Fast DDS has been mended."""
     two = pair(False)
     two.kill_listener()

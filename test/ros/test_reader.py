@@ -66,7 +66,7 @@ def test_a_package_without_messages_is_not_imported(tmp_path: Path, monkeypatch:
         'std_srvs/idl/Trigger_Event',
     ],
 )
-def test_a_type_that_is_none(name: str) -> None:
+def test_an_invalid_type(name: str) -> None:
     """Each is told as the package that is missing, whatever the import raised."""
     with pytest.raises(TypeUnavailable, match=name):
         message_class(name)

@@ -31,7 +31,7 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_only_what_nobody_holds_is_freed(shm: Path) -> None:
+def test_only_unowned_segments_are_freed(shm: Path) -> None:
     """Not that of a process that lives or starts, nor ports, nor what has no lock; to look at them changes nothing."""
     before = names(shm)
     with flock(shm / f'{ALIVE}_el'):
@@ -50,7 +50,7 @@ def test_what_belongs_to_another_user_stays(shm: Path, monkeypatch: pytest.Monke
     assert names(shm) == before
 
 
-def test_a_lock_that_is_none_is_left_alone(shm: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_an_unrelated_lock_is_ignored(shm: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     """Anybody may write there: links are not followed, and a pipe holds nobody up."""
     outside = tmp_path_factory.mktemp('outside') / 'file'
     outside.write_text('precious')
@@ -94,7 +94,7 @@ def is_locked(shm: Path, name: str) -> bool:
         return not was_had
 
 
-def test_a_port_of_a_killed_process_that_somebody_writes_to_is_avoided(tmp_path: Path) -> None:
+def test_a_dead_port_with_a_writer_is_avoided(tmp_path: Path) -> None:
     """In this domain, also where the segment was replaced; not one that lives, and none that nobody has in memory."""
     shm = tmp_path / 'shm'
     shm.mkdir()

@@ -142,7 +142,7 @@ def test_a_part_a_period(spool: Spool, clock: FakeClock) -> None:
     assert [keys(part) for part in catalog.due()] == [['c']]
 
 
-def test_a_backlog_goes_on_at_the_next_look(spool: Spool, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_backlog_continues_at_the_next_poll(spool: Spool, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
     """After an outage parts of a bounded size follow one another without waiting for the next period."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MAX_ROWS', 2)
     hand = Hand()
@@ -191,7 +191,7 @@ def test_two_that_catalog_one_spool(spool: Spool, root: Path, clock: FakeClock) 
     assert_whole(root)
 
 
-def test_what_a_part_left_out_is_in_the_next(spool: Spool, root: Path, clock: FakeClock) -> None:
+def test_rows_skipped_by_a_part_are_in_the_next(spool: Spool, root: Path, clock: FakeClock) -> None:
     """A part that came second for some of its rows is none; what nobody else took is handed out again, without a restart."""
     delivered(spool, 'a')
     theirs = made(spool, clock).parts()
@@ -204,7 +204,7 @@ def test_what_a_part_left_out_is_in_the_next(spool: Spool, root: Path, clock: Fa
     assert [keys(part) for part in catalog.parts()] == [['b']]
 
 
-def test_a_repeat_has_a_row_of_its_own(spool: Spool, root: Path, catalog: CatalogWriter) -> None:
+def test_a_repeat_has_a_separate_row(spool: Spool, root: Path, catalog: CatalogWriter) -> None:
     """Content that was not stored again is found at its own time, under the key that holds it."""
     first, later = (make(f'thor/camera/{second}.jpg', t_start_ns=NOON_NS + second, t_end_ns=NOON_NS + second, dedup=True,
                          metadata={'robot': 'thor'}) for second in (0, 1))  # fmt: skip

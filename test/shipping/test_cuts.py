@@ -88,7 +88,7 @@ def stored(desk: Desk, bag: str, folder: Path) -> list[Recorded]:
     return found
 
 
-def test_a_range_within_a_slice_arrives_as_a_bag_of_its_own(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_range_within_a_slice_arrives_as_a_separate_bag(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has the messages of that time, byte for byte, and about their bytes; the slice stays, and the ledger closes."""
     request, since_ns, until_ns = asked(desk, 12, 14)
     monkeypatch.setattr('shadowhound_data_logger.shipping.slice_cuts.CUT_S', 0.0)
@@ -139,7 +139,7 @@ def test_the_same_range_is_cut_and_sent_once(desk: Desk) -> None:
     assert [row for row in rows(desk.root)[before:] if row['sensor'] == 'bag'] == []
 
 
-def test_a_death_while_it_is_cut_leaves_one_cut(desk: Desk, tmp_path: Path) -> None:
+def test_a_kill_during_a_cut_leaves_one_cut(desk: Desk, tmp_path: Path) -> None:
     """Whether it died before the spool had the cut, or before the request knew of it."""
     request, since_ns, until_ns = asked(desk, 12, 14)
     desk.server._cuts.work = lambda _: False  # type: ignore[method-assign] # it dies before any work is done
@@ -163,7 +163,7 @@ def test_a_death_while_it_is_cut_leaves_one_cut(desk: Desk, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize('damage', ['torn', 'gone'])
-def test_a_slice_that_cannot_be_cut_is_sent_whole(desk: Desk, damage: str) -> None:
+def test_a_slice_that_cannot_be_cut_is_sent_completely(desk: Desk, damage: str) -> None:
     """The robot goes on, and what becomes of the slice is the uploader's to say."""
     path = next((desk.root / 'kept').rglob(f'{BAG}_1.mcap'))
     if damage == 'torn':
@@ -191,7 +191,7 @@ def test_a_request_that_is_taken_back_ends_its_cut(desk: Desk) -> None:
     assert {row['state'] for row in rows(desk.root) if row['sensor'] == 'bag'} == {'kept'}
 
 
-def test_a_slice_without_a_date_is_sent_whole(tmp_path: Path, desk: Desk) -> None:
+def test_a_slice_without_a_date_is_sent_completely(tmp_path: Path, desk: Desk) -> None:
     """Its messages have other times than it is asked for by."""
     bag = 'patrol_20251018_130000'
     desk.spool.commit([kept_slice(tmp_path, 0, bag, clock='set_later')])

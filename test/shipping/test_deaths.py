@@ -54,7 +54,7 @@ def test_a_thread_that_dies_in_a_put(spool: FakeSpool, start: Callable[[MemorySt
     assert sum(worker.failures for worker in uploader.workers) == uploader.status().worker_failures == 2
 
 
-def test_a_drain_lock_that_cannot_be_asked_for(spool: FakeSpool, start: Callable[[MemoryStore], Uploader],
+def test_a_drain_lock_that_cannot_be_opened(spool: FakeSpool, start: Callable[[MemoryStore], Uploader],
                                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """Nothing is sent meanwhile, and it is asked for again."""
     spool.add(3)

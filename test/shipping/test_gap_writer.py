@@ -79,7 +79,7 @@ def what(rows: list[dict[str, Any]]) -> list[tuple[str, str | None, int | None, 
     return [(row['what'], row['cause'], row['count'], (row['to_ns'] - NOON_NS) / SECOND) for row in rows]
 
 
-def test_what_was_missed_is_told_once_with_a_watermark_behind_it(spool: Spool, root: Path) -> None:
+def test_gaps_are_reported_once_before_their_watermark(spool: Spool, root: Path) -> None:
     """A row for the gap, one up to where all is known; and no part while nothing changes."""
     hear(spool, 1)
     store(spool, 'a')
@@ -95,7 +95,7 @@ def test_what_was_missed_is_told_once_with_a_watermark_behind_it(spool: Spool, r
     assert catalog.parts() == []
 
 
-def test_another_process_goes_on_where_parts_are_durable(spool: Spool, root: Path) -> None:
+def test_another_process_continues_after_durable_parts(spool: Spool, root: Path) -> None:
     """What a process handed out and did not spool is told by the next; what it spooled is not told again."""
     hear(spool, 1, 6)
     spool.commit()
@@ -158,7 +158,7 @@ def test_no_watermark_overtakes_its_gaps(spool: Spool, root: Path) -> None:
     assert [row['what'] for row in told(catalog.parts())] == ['complete']
 
 
-def test_gaps_of_another_date_are_told_before_the_watermark(spool: Spool, root: Path) -> None:
+def test_gaps_of_another_date_are_reported_before_the_watermark(spool: Spool, root: Path) -> None:
     """They are parts of their own, of which any may come first."""
     catalog = writer(root)
     hear(spool, 1)
@@ -170,7 +170,7 @@ def test_gaps_of_another_date_are_told_before_the_watermark(spool: Spool, root: 
     assert [row['what'] for row in told(catalog.parts())] == ['complete']
 
 
-def test_what_a_lost_part_told_is_told_again(spool: Spool, root: Path) -> None:
+def test_gaps_of_a_lost_part_are_reported_again(spool: Spool, root: Path) -> None:
     """Somebody deleted its file before it was delivered."""
     catalog = writer(root)
     hear(spool, 1, 6)
@@ -195,7 +195,7 @@ def test_a_full_disk_keeps_the_parts(root: Path) -> None:
     spool.close()
 
 
-def test_all_that_is_remembered_is_told_again_when_asked(spool: Spool, root: Path) -> None:
+def test_resending_reports_all_remembered_gaps(spool: Spool, root: Path) -> None:
     """Where the store lost its parts: every gap, and the watermark behind them."""
     catalog = writer(root)
     hear(spool, 1, 6)
@@ -215,7 +215,7 @@ def test_all_that_is_remembered_is_told_again_when_asked(spool: Spool, root: Pat
 
 
 @pytest.mark.parametrize('is_of_older_version', [False, True])
-def test_what_is_forgotten_is_in_no_watermark_that_is_told_again(spool: Spool, root: Path, is_of_older_version: bool) -> None:
+def test_resent_watermarks_exclude_forgotten_gaps(spool: Spool, root: Path, is_of_older_version: bool) -> None:
     """The store may have lost what the robot forgot: it would be taken for all that was lost."""
     hear(spool, 20)
     store(spool, 'a')
@@ -236,9 +236,7 @@ def test_what_is_forgotten_is_in_no_watermark_that_is_told_again(spool: Spool, r
     assert (total.count, total.from_ns, total.to_ns) == (5, None, None), 'a sum has no time'
 
 
-def test_no_watermark_covers_what_was_forgotten_before_it_was_told(
-    spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_watermark_covers_unreported_forgotten_gaps(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows beyond the bound of the journal go, told or not: where they were, nobody knows what was lost."""
     hear(spool, 20)
     store(spool, 'a')
@@ -279,7 +277,7 @@ def test_a_session_that_died_ends_where_it_was_heard_last(root: Path) -> None:
     second.close()
 
 
-def test_revisions_go_on_when_the_index_is_made_anew(root: Path) -> None:
+def test_revisions_continue_after_the_index_is_rebuilt(root: Path) -> None:
     """Versions begin anew then; what is told by the new index is newer than all that the old one told."""
     spool = new_spool(root, FakeClock())
     spool.open()
@@ -298,7 +296,7 @@ def test_revisions_go_on_when_the_index_is_made_anew(root: Path) -> None:
     spool.close()
 
 
-def test_the_time_of_a_boot_is_told_when_its_clock_is_known(spool: Spool, root: Path) -> None:
+def test_gaps_of_a_boot_are_reported_once_its_clock_is_known(spool: Spool, root: Path) -> None:
     """First without a date, then with one, under the same name: the newest is the dated one."""
     with spool.accounts.entry(CAMERA) as account:
         account.drop('queue_full', 3, by_arrival(5 * SECOND), by_arrival(6 * SECOND))
@@ -317,7 +315,7 @@ def test_the_time_of_a_boot_is_told_when_its_clock_is_known(spool: Spool, root: 
     assert catalog.parts() == []
 
 
-def test_a_mission_s_end_is_told_soon(spool: Spool, root: Path) -> None:
+def test_a_missions_end_is_reported_soon(spool: Spool, root: Path) -> None:
     """Within seconds, not within the period."""
     now = [0.0]
     catalog = writer(root, monotonic=lambda: now[0])
@@ -332,9 +330,7 @@ def test_a_mission_s_end_is_told_soon(spool: Spool, root: Path) -> None:
     assert len(told(catalog.due())) == 1
 
 
-def test_a_backlog_of_rows_is_told_in_pieces_and_the_watermark_last(
-    spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_backlog_of_rows_is_split_with_the_watermark_last(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No watermark stands over rows that are not told yet."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MAX_ROWS', 2)
     for number in range(1, 100, 20):

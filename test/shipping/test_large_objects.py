@@ -45,9 +45,7 @@ def test_a_single_thread_ships_large_objects_too(spool: FakeSpool, clock: Time, 
     assert Drive(spool, clock, threads=1).next() == large[0]
 
 
-def test_a_large_object_that_failed_takes_no_more_than_its_share(
-    spool: FakeSpool, clock: Time, large: list[SpooledObject]
-) -> None:
+def test_a_failed_large_object_keeps_to_its_share(spool: FakeSpool, clock: Time, large: list[SpooledObject]) -> None:
     """A retry is a large object as well."""
     drive = Drive(spool, clock, threads=2)
     spool.add(50, priority=9)

@@ -22,7 +22,7 @@ def shipped(drive: Drive, count: int) -> list[SpooledObject]:
     return found
 
 
-def test_what_is_new_goes_beside_a_backlog(drive: Drive) -> None:
+def test_new_objects_are_sent_next_to_a_backlog(drive: Drive) -> None:
     """Every second turn, as long as some is there: in turns the most important, and the priority that waits for the longest."""
     old = drive.spool.add(200, priority=2)
     drive.schedule.wake(clouds := drive.spool.add(3, priority=7))
@@ -73,7 +73,7 @@ def test_a_new_object_of_a_bucket_that_takes_nothing_waits(drive: Drive) -> None
     assert drive.next() is None
 
 
-def test_what_is_new_while_the_store_is_away_is_no_probe_of_its_own(drive: Drive) -> None:
+def test_new_objects_do_not_probe_an_unreachable_store(drive: Drive) -> None:
     """One object is tried at a time, whatever comes."""
     (first,) = drive.spool.add()
     assert drive.next() == first

@@ -12,7 +12,7 @@ from shadowhound_data_logger.shipping.failures import Verdict
 AWAY = StoreUnavailable('Tower is away')
 
 
-def test_while_the_store_is_away_there_is_one_probe_at_a_time(drive: Drive) -> None:
+def test_an_unreachable_store_gets_one_probe_at_a_time(drive: Drive) -> None:
     """After a failure nobody goes on before the backoff, and then one thread alone."""
     drive.spool.add(5)
     first = drive.next()
@@ -39,7 +39,7 @@ def test_the_next_probe_is_another_object(drive: Drive) -> None:
     assert drive.said() == []
 
 
-def test_an_object_that_fails_while_others_do_not_stops_nobody(drive: Drive) -> None:
+def test_one_failing_object_does_not_block_others(drive: Drive) -> None:
     """Its second failure after others' success is its own: no breaker opens any more, and it is tried ever more rarely."""
     bad = drive.spool.add(priority=0)[0]
     drive.spool.add(500)

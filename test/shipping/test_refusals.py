@@ -25,7 +25,7 @@ from shadowhound_data_logger.shipping.schedule import Rest
 AWAY = StoreUnavailable('Tower is away')
 
 
-def test_rejected_credentials_pause_everything_and_are_said_at_once(drive: Drive) -> None:
+def test_rejected_credentials_pause_everything_and_are_logged_immediately(drive: Drive) -> None:
     """No object is to blame: none is deferred, and one probe at a time finds out when it is right again."""
     drive.spool.add(4)
     for _ in range(5):
@@ -39,7 +39,7 @@ def test_rejected_credentials_pause_everything_and_are_said_at_once(drive: Drive
     assert drive.said()[1:] == [(Verdict.PAUSE, None, True)]
 
 
-def test_an_outage_whose_cause_changes_says_each_cause_once(drive: Drive) -> None:
+def test_each_cause_of_an_outage_is_logged_once(drive: Drive) -> None:
     """Tower comes back with other keys: that is news, its coming and going afterwards is not."""
     drive.spool.add(4)
     for error in (AWAY, AWAY, CredentialsRejected('wrong key'), AWAY, CredentialsRejected('wrong key')):
@@ -67,7 +67,7 @@ def test_a_missing_bucket_holds_up_its_own_objects_only(drive: Drive) -> None:
     assert drive.said()[1:] == [(Verdict.BUCKET, 'missing', True)]
 
 
-def test_others_go_on_while_a_missing_bucket_is_being_probed(drive: Drive) -> None:
+def test_other_buckets_continue_while_a_missing_one_is_probed(drive: Drive) -> None:
     """A probe that hangs holds up nobody outside its bucket."""
     drive.spool.add(300, bucket='missing', priority=0)
     one, two = drive.spool.add(2, bucket='there', priority=9)
@@ -146,7 +146,7 @@ def test_denials_that_come_and_go_quarantine_nothing(clock: Time, tmp_path: Path
     assert denied > 25 * days
 
 
-def test_when_all_are_denied_none_is_quarantined_and_all_go_once_the_rights_are_there(drive: Drive) -> None:
+def test_if_all_are_denied_they_wait_for_permission(drive: Drive) -> None:
     """The credentials lack the right: the bucket waits, said once, and other buckets go on."""
     drive.spool.add(20, bucket='closed', priority=0)
     drive.spool.add(20, bucket='open', priority=9)

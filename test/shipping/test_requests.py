@@ -29,7 +29,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
     made.spool.close()
 
 
-def test_what_is_on_request_stays_until_it_is_asked_for(desk: Desk) -> None:
+def test_objects_on_request_stay_until_requested(desk: Desk) -> None:
     """It is accounted for as kept, lies apart, and is sent, verified, once somebody asks; the ledger closes all along."""
     desk.keeps(*(frame(number) for number in range(5)))
     assert desk.deliver() == 0
@@ -99,7 +99,7 @@ def test_a_kill_at_any_moment_loses_no_request(desk: Desk) -> None:
     assert_whole(desk.root)
 
 
-def test_the_oldest_goes_first_and_nothing_that_is_asked_for(tmp_path: Path) -> None:
+def test_eviction_starts_with_the_oldest_and_spares_requested_objects(tmp_path: Path) -> None:
     """Beyond keep.max_bytes what nobody waits for is evicted, as the ledger says; where all is waited for, the new."""
     size = 200 << 10
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
@@ -226,7 +226,7 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
     assert len(desk.released) == 1
 
 
-def test_a_death_while_many_objects_are_accepted_leaves_no_half_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_during_acceptance_leaves_no_partial_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A request is accepted in pieces, so that nobody waits for long; before its row nothing of it counts, nor bars eviction."""
     monkeypatch.setattr('shadowhound_data_logger.spool.requests.PIECE', 4)
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
@@ -258,7 +258,7 @@ def test_a_death_while_many_objects_are_accepted_leaves_no_half_request(tmp_path
         assert_whole(desk.root)
 
 
-def test_a_requester_that_floods_keeps_nobody_waiting(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flooding_requester_delays_no_other(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     """One asks for all in more ways than are looked at together; another one's few objects are among the first that are sent."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.requests.AT_A_TIME', 6)
     size = 60 << 10

@@ -25,7 +25,7 @@ def test_important_objects_go_first_and_each_fourth_is_the_oldest(drive: Drive) 
     assert [number for number in order if number in new] == new[:30]
 
 
-def test_the_spool_is_asked_for_a_bounded_number_now_and_then(drive: Drive) -> None:
+def test_the_spool_is_polled_for_a_bounded_number(drive: Drive) -> None:
     """What a claim costs does not depend on the backlog: a thousand objects take some 2 x 1000 / 60 queries."""
     drive.spool.add(1000)
     for _ in range(1000):
@@ -45,7 +45,7 @@ def test_what_is_urgent_overtakes_what_was_looked_up_before(drive: Drive) -> Non
     assert drive.next() == urgent
 
 
-def test_what_was_told_of_is_shipped_without_a_look(drive: Drive) -> None:
+def test_announced_objects_are_shipped_without_a_poll(drive: Drive) -> None:
     """Where nothing else waits, what has just been spooled is known, and goes in its order."""
     assert drive.next() is None
     looks = drive.spool.looks
@@ -59,7 +59,7 @@ def test_what_was_told_of_is_shipped_without_a_look(drive: Drive) -> None:
     assert drive.spool.looks == looks
 
 
-def test_where_much_waits_the_spool_is_asked_for_it(drive: Drive) -> None:
+def test_a_backlog_is_read_from_the_spool(drive: Drive) -> None:
     """What was told of is then a part of the backlog only."""
     assert drive.next() is None
     looks = drive.spool.looks

@@ -79,7 +79,7 @@ def lines(caplog: pytest.LogCaptureFixture, level: int) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == level]
 
 
-def test_everything_is_delivered_once_and_drain_says_so(spool: FakeSpool, start: Start) -> None:
+def test_drain_delivers_everything_once(spool: FakeSpool, start: Start) -> None:
     """Before and after open, with a wake for what came later."""
     items = spool.add(150)
     store = Recording()
@@ -114,7 +114,7 @@ def test_after_an_outage_everything_is_delivered_once(
     assert len(lines(caplog, logging.INFO)) == 1
 
 
-def test_one_object_that_does_not_get_through_stops_nobody(spool: FakeSpool, start: Start) -> None:
+def test_one_failing_object_stops_no_other_upload(spool: FakeSpool, start: Start) -> None:
     """The rest is delivered, it stays, and it goes when it can."""
     bad, *rest = spool.add(60)
     store = Recording(lambda item: StoreUnavailable('broken') if item and item.id == bad.id else None)
@@ -125,7 +125,7 @@ def test_one_object_that_does_not_get_through_stops_nobody(spool: FakeSpool, sta
     assert uploader.drain(10.0)
 
 
-def test_rejected_credentials_pause_with_one_line_and_it_goes_on_by_itself(
+def test_rejected_credentials_pause_with_one_log_line_and_resume(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """The error names the remedy; nothing is quarantined."""
@@ -183,7 +183,7 @@ def test_terminal_failures_are_quarantined_with_their_reason_and_few_words(
     assert len(lines(caplog, logging.ERROR)) == 2
 
 
-def test_an_object_that_was_evicted_meanwhile_raises_no_alarm(
+def test_an_object_evicted_during_upload_is_not_an_error(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """Its file is gone: its outcome says so, the log has no error."""

@@ -57,7 +57,7 @@ def files(root: Path, folder: str) -> list[str]:
     return sorted(path.name for path in (root / folder).rglob('*') if path.is_file())
 
 
-def test_what_is_delivered_leaves_the_spool(draining: Draining, store: MemoryStore) -> None:
+def test_delivered_objects_are_removed_from_the_spool(draining: Draining, store: MemoryStore) -> None:
     """Through an outage in the middle: every object is in the store once, no file is left."""
     draining.uploader.open()
     draining.spool.commit([data_object(number) for number in range(60)])
@@ -75,7 +75,7 @@ def test_what_is_delivered_leaves_the_spool(draining: Draining, store: MemorySto
     assert draining.uploader.status().delivered == 120
 
 
-def test_what_is_refused_lies_in_quarantine(draining: Draining, store: MemoryStore) -> None:
+def test_rejected_objects_are_quarantined(draining: Draining, store: MemoryStore) -> None:
     """Under its reason; the rest is delivered."""
 
     def fail(item: SpooledObject | None) -> Exception | None:

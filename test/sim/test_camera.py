@@ -24,7 +24,7 @@ def _frame(front: Camera, t: float, caption: str = '') -> np.ndarray:
 
 
 @pytest.mark.long('every pixel')
-def test_every_pixel_is_drawn_anew(front: Camera) -> None:
+def test_every_pixel_is_redrawn(front: Camera) -> None:
     """A frame depends on the time alone: what was drawn before shows nowhere."""
     first = {t: _frame(front, t) for t in np.arange(0, 60, 5.9)}
     for t in reversed(list(first)):
@@ -38,7 +38,7 @@ def test_no_two_frames_are_alike(front: Camera) -> None:
     assert not np.array_equal(_frame(front, 3.0), _frame(front, 3.0333))
 
 
-def test_walls_stand_where_the_pinhole_puts_them(front: Camera) -> None:
+def test_walls_are_where_the_pinhole_model_puts_them(front: Camera) -> None:
     """The foot of the wall ahead is seen at horizon + focal length * camera height / depth, to the row."""
     checked = 0
     for t in np.arange(0.5, 59, 1.3):

@@ -224,7 +224,7 @@ def look_until(outage: StoreOutage, t: float, state: str, *, is_last: bool = Fal
 
 
 @pytest.mark.timeout(60)
-def test_the_s3_server_goes_away_once_and_comes_back() -> None:
+def test_the_s3_server_stops_once_and_restarts() -> None:
     """It goes at its time, stays away for its length, and its span is remembered."""
     tower = FakeTower()
     with StoreOutage(tower, 25.0, 10.0) as outage:  # type: ignore[arg-type]
@@ -281,7 +281,7 @@ def test_a_folder_of_an_earlier_demo_is_replaced(tmp_path: Path) -> None:
         assert [path.name for path in folder.iterdir()] == [demo.MARKER]
 
 
-def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_foreign_folder_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit code 2, a line that says so, and nothing is touched."""
     (tmp_path / 'thesis.tex').touch()
     assert demo.main(['--folder', str(tmp_path)]) == 2
@@ -307,7 +307,7 @@ def test_times_that_make_no_sense_are_refused(arguments: list[str], tmp_path: Pa
     assert not (tmp_path / 'demo').exists()
 
 
-def test_errors_of_the_node_are_told(good: Scene) -> None:
+def test_errors_of_the_node_are_reported(good: Scene) -> None:
     """How many, and the first of them, as it stands in the log."""
     record = Record(good.published, (READING,), None, ('[ERROR] [1.0] [sensor_logger]: intake failed', 'another'))
     text = said(good.audit(), record)
@@ -320,7 +320,7 @@ def test_errors_of_the_node_are_told(good: Scene) -> None:
     'line',
     ['[ERROR] [1.1] [sensor_logger]: intake failed', '[FATAL] [1.1] [sensor_logger]: no', 'Traceback (most recent call last):'],
 )
-def test_a_node_that_logged_an_error_is_told(tmp_path: Path, line: str) -> None:
+def test_a_node_that_logged_an_error_is_reported(tmp_path: Path, line: str) -> None:
     """However well the ledger balances: each line counts, and lines that only speak of errors do not."""
     log = tmp_path / 'node.log'
     with demo_processes.Child('platform', [], os.environ, log) as child:

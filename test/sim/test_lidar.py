@@ -26,14 +26,14 @@ def _gaps(points: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize('t', TIMES)
-def test_every_point_lies_on_a_surface(lidar: Lidar, t: float) -> None:
+def test_every_point_is_on_a_surface(lidar: Lidar, t: float) -> None:
     """No point floats in the air: each is within five standard deviations of a box, the floor or the ceiling."""
     points = lidar.scan(t)[::7, :3].astype(np.float64)
     assert _gaps(points, lidar.world.plan.bounds).max() < 0.04
 
 
 @pytest.mark.parametrize('t', TIMES)
-def test_nothing_stands_between_the_sensor_and_a_point(lidar: Lidar, t: float) -> None:
+def test_no_object_is_between_sensor_and_point(lidar: Lidar, t: float) -> None:
     """The straight way to each point leads through no box, but for its last centimetres."""
     points = lidar.scan(t)[::41, :3].astype(np.float64)
     origin = np.array(lidar.origin(lidar.world.pose(t)))

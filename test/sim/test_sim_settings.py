@@ -47,7 +47,7 @@ class SlowRobot:
         self.samples.append((t, stamp_ns))
 
 
-def test_a_late_robot_catches_up_and_leaves_nothing_out() -> None:
+def test_a_late_robot_catches_up_completely() -> None:
     """After a stall everything that was due is published, each with the time at which it was due."""
     robot = SlowRobot()
     run(robot, SimSettings(duration_s=0.05), lambda: False)  # type: ignore[arg-type]

@@ -240,7 +240,7 @@ def test_a_publisher_that_leaps_takes_little_memory() -> None:
     assert size < 300_000
 
 
-def test_numbers_that_lie_stop_no_commit(opened: Open, root: Path) -> None:
+def test_invalid_sequence_numbers_stop_no_commit(opened: Open, root: Path) -> None:
     """They come from the network: sums of them that SQLite could not hold, or a start would take for damage, are not believed."""
     spool = opened()
     for publisher in range(2 * MAX_PUBLISHERS):
@@ -402,7 +402,7 @@ def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
     assert accounts.snapshot({}) is not None
 
 
-def test_samples_of_a_topic_that_nobody_received_show() -> None:
+def test_samples_of_an_unreceived_topic_are_detected() -> None:
     """An object of a topic without an account makes the topic's account negative at once, not silently nothing."""
     snapshot = Accounts().snapshot({'/ghost': (2, by_arrival(1))})
     assert snapshot is not None
@@ -450,7 +450,7 @@ def test_other_types_are_few() -> None:
     assert len(found['b/msg/B1'].publishers) == len(found[MORE_TYPES].publishers) == MAX_NODES
 
 
-def test_without_a_named_type_nobody_knows_whose_messages_are_missed() -> None:
+def test_without_a_named_type_losses_are_unknown() -> None:
     """Where another type is published and not counted, what was missed of the topic is unknown, and not 0."""
     accounts = Accounts()
     with accounts.entry('/odom') as account:

@@ -43,7 +43,7 @@ def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
         b' ' * (MAX_BYTES + 1),
     ],
 )
-def test_a_damaged_file_has_none(tmp_path: Path, damage: bytes) -> None:
+def test_a_damaged_file_is_empty(tmp_path: Path, damage: bytes) -> None:
     """And the next act is kept."""
     act_record.file(tmp_path, 'thor').write_bytes(damage)
     assert act_record.read(tmp_path, 'thor') == []
@@ -51,6 +51,6 @@ def test_a_damaged_file_has_none(tmp_path: Path, damage: bytes) -> None:
     assert [act['do'] for act in act_record.read(tmp_path, 'thor')] == ['flush']
 
 
-def test_a_disk_that_takes_nothing_stops_nobody(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_write_error_stops_no_request(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     ActRecord(tmp_path / 'gone', 'thor', lambda: 1).add('operator', 'flush', ok=True, said='done')
     assert 'cannot record' in caplog.text

@@ -32,7 +32,7 @@ def final(number: int, name: str) -> Binding:
     return Binding(number, f'thor/final/{name}', {'bound': 'yes'}, NOON_NS + 5, NOON_NS + 6)
 
 
-def test_held_objects_are_told_oldest_first(spool: Spool) -> None:
+def test_held_objects_are_listed_oldest_first(spool: Spool) -> None:
     """Those of one reason, as many as are asked for, with all that a binding is made from."""
     put(spool, *(make(f'k/{name}', held='clock', metadata={'name': name}) for name in 'cab'))
     put(spool, make('k/other', held='mission-7'), make('k/free'))
@@ -68,7 +68,7 @@ def test_what_is_bound_counts_as_before(spool: Spool, root: Path) -> None:
     assert (stored['held'], stored['pending'], stored['delivered']) == (1, 1, 1)
 
 
-def test_what_is_bound_still_says_whose_messages_it_holds(spool: Spool, root: Path) -> None:
+def test_a_bound_object_keeps_its_topic(spool: Spool, root: Path) -> None:
     """Under its final name too the file names the accounts: an index that is lost is made of files."""
     (binding,) = hold(spool, 'a', topic=None, counts={'bag:/imu': 3, 'bag:/odom': 1})
     before = description_of(root / HELD / 'thor/provisional/a')
@@ -102,7 +102,7 @@ def test_a_name_that_was_given_out_often_is_found_in_few_questions(spool: Spool,
     assert len(asked) < 300 * 20
 
 
-def test_what_is_not_held_any_more_is_left_out(spool: Spool, opened: Open, root: Path) -> None:
+def test_objects_no_longer_held_are_skipped(spool: Spool, opened: Open, root: Path) -> None:
     """A second binding of an object, by another process say, changes nothing; nor does one of an object that left."""
     bindings = hold(spool, 'a', 'b')
     (done,) = opened().bind(bindings[:1])
@@ -113,7 +113,7 @@ def test_what_is_not_held_any_more_is_left_out(spool: Spool, opened: Open, root:
     assert_whole(root)
 
 
-def test_a_name_that_can_be_none_binds_nothing(spool: Spool, root: Path) -> None:
+def test_an_invalid_name_binds_nothing(spool: Spool, root: Path) -> None:
     """One refused name leaves all objects as they were."""
     one, two = hold(spool, 'a', 'b')
     before = files(root)
@@ -143,7 +143,7 @@ def test_a_failing_disk_binds_nothing(spool: Spool, root: Path, monkeypatch: pyt
     assert_whole(root)
 
 
-def test_a_file_that_is_gone_does_not_hold_up_the_others(spool: Spool, root: Path) -> None:
+def test_a_missing_file_does_not_block_others(spool: Spool, root: Path) -> None:
     """It is bound like any other, so that delivery finds that it is missing."""
     bindings = hold(spool, 'a', 'b')
     (root / HELD / 'thor/provisional/a').unlink()
@@ -151,7 +151,7 @@ def test_a_file_that_is_gone_does_not_hold_up_the_others(spool: Spool, root: Pat
     assert spool.held('clock') == []
 
 
-def test_how_long_it_waits_is_told_from_a_clock_that_is_set(spool: Spool, root: Path, clock: FakeClock) -> None:
+def test_waiting_time_starts_once_the_clock_is_set(spool: Spool, root: Path, clock: FakeClock) -> None:
     """An object of 1970 waits since its own end, once that is known, and not for half a century."""
     clock.now_ns = 60
     bindings = hold(spool, 'a')
@@ -245,7 +245,7 @@ def test_a_start_of_another_process_keeps_out_of_a_binding(spool: Spool, root: P
     assert_whole(root)
 
 
-def test_a_binding_that_a_dead_process_began_is_gone_on_with(opened: Open, root: Path) -> None:
+def test_an_interrupted_binding_is_completed(opened: Open, root: Path) -> None:
     """Parts that a failing SQLite left in their place are bound by the next try, without a start in between."""
     spool = opened()
     bindings = hold(spool, 'a', 'b')

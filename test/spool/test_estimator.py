@@ -137,7 +137,7 @@ def test_a_publisher_that_is_starved_and_catches_up_loses_nothing() -> None:
     assert ear.lost <= 1
 
 
-def test_a_node_that_stands_still() -> None:
+def test_a_stalled_node() -> None:
     """What a full history overwrote meanwhile is lost by transport: nobody asked for it."""
     sent = even(1000)
     ear = Ear().hear(sent[:500]).hear(without(sent[500:], (10, 140)), asleep_s=3.0)
@@ -274,13 +274,13 @@ def test_a_counter_counts_exactly(first: int, step: int, wrap: int, start: int, 
         assert missed.total() == length
 
 
-def test_a_counter_that_nobody_fills() -> None:
+def test_a_counter_that_stays_zero() -> None:
     """It says nothing, and nothing is claimed."""
     estimator = LossEstimator(Expectation('counter:tick', 0.0, 1 << 32))
     assert sum(estimator.observe([0] * 10, ArrivalContext()).covered for _ in range(100)) == 0
 
 
-def test_a_counter_that_begins_anew_is_no_loss() -> None:
+def test_a_restarted_counter_is_not_a_loss() -> None:
     """A robot that was started again counts from 0."""
     estimator = LossEstimator(Expectation('counter:tick', 2.0, 1 << 32))
     missed: Counter[str] = Counter()
@@ -309,7 +309,7 @@ def test_one_of_a_crowd_is_not_counted() -> None:
     assert (found.covered, found.lost, estimate.known) == (100, {}, True)
 
 
-def test_publishers_that_are_told_apart_have_rhythms_of_their_own() -> None:
+def test_each_publisher_has_its_own_rate() -> None:
     """Whatever their rates, and whether the graph knows several."""
     estimate = TopicEstimate()
     context = ArrivalContext(is_only=False, is_shared=True)
@@ -318,7 +318,7 @@ def test_publishers_that_are_told_apart_have_rhythms_of_their_own() -> None:
     assert (found.covered, found.missed) == (780, {TRANSPORT: 20})
 
 
-def test_the_next_session_goes_on() -> None:
+def test_the_next_session_continues() -> None:
     """With the rhythm and the last stamp: what was sent meanwhile was missed by the restart."""
     before = TopicEstimate()
     sent = even(600)

@@ -115,7 +115,7 @@ def test_a_file_outlives_a_transaction_that_gives_up_the_ballast(
     assert_whole(root)
 
 
-def test_a_source_that_is_gone_is_missing(spool: Spool, root: Path, source: Path) -> None:
+def test_a_removed_source_is_missing(spool: Spool, root: Path, source: Path) -> None:
     """It is in the ledger as quarantined, and bars the way to nothing that is committed with it."""
     source.unlink()
     (other,) = put(spool, sliced(source), make('thor/other.jpg'))

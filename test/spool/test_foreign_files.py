@@ -87,7 +87,7 @@ def test_a_description_that_makes_no_sense(opened: Open, root: Path, used: dict[
     assert (row['samples'], row['topic'], row['protected'], row['priority'] <= 9) == (0, None, 0, True)
 
 
-def test_a_file_that_is_not_what_it_says(opened: Open, root: Path, used: dict[str, bytes]) -> None:
+def test_a_file_with_foreign_content(opened: Open, root: Path, used: dict[str, bytes]) -> None:
     """Content that differs from its own description is not adopted as if it were whole."""
     path = root / READY / 'thor/odd.bin'
     path.write_bytes(b'changed')

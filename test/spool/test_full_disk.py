@@ -70,7 +70,7 @@ def test_a_group_that_is_too_large(opened: Open, root: Path) -> None:
     assert assert_whole(root)['objects']['evicted'] == 4
 
 
-def test_a_shortage_is_told_when_it_begins_and_ends(opened: Open, clock: FakeClock, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_shortage_is_logged_at_start_and_end(opened: Open, clock: FakeClock, caplog: pytest.LogCaptureFixture) -> None:
     """A spool that is full for an hour says so once a minute, and when it is over, not with every commit."""
     caplog.set_level(logging.INFO)
     spool = opened(max_bytes=MEBI)
@@ -96,7 +96,7 @@ def test_protected_objects_stay(opened: Open, root: Path) -> None:
     assert found['topics']['/camera']['stored_in']['evicted'] == 1
 
 
-def test_what_can_never_fit_costs_nothing_else(opened: Open, root: Path) -> None:
+def test_an_object_that_can_never_fit_evicts_nothing(opened: Open, root: Path) -> None:
     """An object larger than the spool is recorded as evicted, and nothing is evicted in vain for it."""
     spool = opened(max_bytes=MEBI)
     put(spool, make('small', b'x', priority=9))
@@ -117,7 +117,7 @@ def test_free_space_is_left(opened: Open, root: Path, monkeypatch: pytest.Monkey
     assert_whole(root)
 
 
-def test_files_that_somebody_removed_take_no_room(opened: Open, root: Path) -> None:
+def test_removed_files_use_no_space(opened: Open, root: Path) -> None:
     """A person who empties the spool by hand gets its room back."""
     spool = opened(max_bytes=MEBI)
     put(spool, *(make(f'a{number}', BODY) for number in range(4)))

@@ -107,7 +107,7 @@ def test_a_late_number_takes_its_loss_out_of_the_journal(spool: Spool, root: Pat
     assert ledger.read(root, 'thor')['balanced']
 
 
-def test_who_copies_the_journal_hears_of_every_change(spool: Spool, root: Path) -> None:
+def test_a_copy_of_the_journal_sees_every_change(spool: Spool, root: Path) -> None:
     """By version: new rows, changed ones, and those that say nothing any more."""
     hear(spool, 1, 5)
     spool.commit()
@@ -120,7 +120,7 @@ def test_who_copies_the_journal_hears_of_every_change(spool: Spool, root: Path) 
     assert [gap.version for gap in changed] == sorted(gap.version for gap in changed)
 
 
-def test_the_watermark_stands_before_what_is_open(spool: Spool) -> None:
+def test_the_watermark_is_before_open_batches(spool: Spool) -> None:
     """While a message has no outcome yet, or is not delivered, it may still be lost; the journal is complete up to it."""
     hear(spool, 1)
     (item,) = spool.commit([make('a')])
@@ -295,9 +295,7 @@ def test_a_batch_that_overtook_another_claims_nothing_for_it(root: Path, opened:
     assert watermark(spool)[1] < 0.2
 
 
-def test_a_commit_that_is_tried_again_claims_nothing_for_what_came_meanwhile(
-    spool: Spool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_retried_commit_claims_no_later_messages(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has the objects that it had before; one that was made since then is only in memory."""
     spool.accounts.oldest_open = dict
     hear(spool, 1)
@@ -486,7 +484,7 @@ def test_rows_of_an_hour_are_bounded(root: Path, monkeypatch: pytest.MonkeyPatch
     spool.close()
 
 
-def test_a_gap_stays_until_it_is_told(root: Path) -> None:
+def test_a_gap_is_kept_until_it_is_reported(root: Path) -> None:
     """Of a robot that was off for longer than rows are kept it began too long ago already. One that just ended stays as well."""
     clock = FakeClock()
     spool = new_spool(root, clock)

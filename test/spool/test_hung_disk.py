@@ -34,7 +34,7 @@ def hanging(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spool]:
     thread.join(60)
 
 
-def test_what_is_pending_is_told_while_a_commit_hangs(hanging: Spool) -> None:
+def test_pending_objects_are_listed_while_a_commit_hangs(hanging: Spool) -> None:
     """The line in the log that says so must not hang, too."""
     assert hanging.pending_count() == 1
 

@@ -28,7 +28,7 @@ def run_sql(root: Path, *statements: str) -> None:
     connection.close()
 
 
-def test_the_whole_of_it(spool: Spool, root: Path) -> None:
+def test_a_complete_ledger(spool: Spool, root: Path) -> None:
     """Every figure of the ledger's contract, from one session of two topics."""
     with spool.accounts.entry('/camera') as account:
         account.type = 'sensor_msgs/msg/CompressedImage'

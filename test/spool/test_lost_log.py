@@ -50,7 +50,7 @@ def test_a_file_that_was_not_committed_is_removed(opened: Open, root: Path) -> N
     assert [row['key'] for row in rows(root) if row['state'] == 'pending'] == ['thor/whole.jpg']
 
 
-def test_a_part_that_is_not_whole_is_not_adopted(opened: Open, root: Path) -> None:
+def test_an_incomplete_part_is_not_adopted(opened: Open, root: Path) -> None:
     """A cut one is removed, log or not, and the other one of its commit is kept."""
     died(root, 'committed')
     part = min((root / 'incoming').iterdir())

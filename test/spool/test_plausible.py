@@ -52,7 +52,7 @@ def test_what_cannot_be_ours_is_found(index: Path, opened: Open, change: str) ->
     assert opened().recovery.counts['damaged index rebuilt'] == 1
 
 
-def test_totals_of_other_objects_are_told(index: Path, opened: Open, caplog: pytest.LogCaptureFixture) -> None:
+def test_mismatching_totals_are_reported(index: Path, opened: Open, caplog: pytest.LogCaptureFixture) -> None:
     """An object that counts for another topic than its total says shows in no sum of today, and is said all the same."""
     with closing(sqlite3.connect(index)) as db:
         db.execute("UPDATE objects SET topic = '/other' WHERE key = 'thor/3'")

@@ -121,7 +121,7 @@ def test_it_is_dated_when_the_clock_is_set(started: Callable[..., Run], root: Pa
     assert run.redating.step() == []
 
 
-def test_what_is_encoded_after_the_clock_was_set_is_dated_at_once(started: Callable[..., Run], clocks: Clocks) -> None:
+def test_objects_encoded_after_the_clock_was_set_are_dated_immediately(started: Callable[..., Run], clocks: Clocks) -> None:
     """A batch of before, encoded after: it is never held."""
     run = started()
     item = run.made()
@@ -165,7 +165,7 @@ def test_what_an_earlier_boot_left(started: Callable[..., Run], root: Path, cloc
     assert [item.key for item in run.redating.step()] == [FINAL]
 
 
-def test_what_an_earlier_boot_left_whose_clock_was_set(started: Callable[..., Run], clocks: Clocks) -> None:
+def test_objects_of_an_earlier_boot_with_a_set_clock(started: Callable[..., Run], clocks: Clocks) -> None:
     """A process that ended before it could name them left the offset of its boot."""
     run = started()
     run.take()
@@ -190,7 +190,7 @@ def test_a_lost_index_costs_no_date(started: Callable[..., Run], root: Path, clo
 
 
 @pytest.mark.parametrize('pattern', ['../{date}/{time}', 'thor/{date}', '', 'a' * 300])
-def test_a_pattern_that_somebody_changed(started: Callable[..., Run], pattern: str, clocks: Clocks) -> None:
+def test_a_changed_key_pattern(started: Callable[..., Run], pattern: str, clocks: Clocks) -> None:
     """A name that cannot be one does not stop the others: it goes without a date, or under what is left of its pattern."""
     run = started()
     run.take({}, {'key_pattern': 'x'})

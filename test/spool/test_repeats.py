@@ -35,7 +35,7 @@ def test_the_same_picture_is_stored_once(spool: Spool, root: Path) -> None:
     assert all(row['settled_ns'] for row in repeats), 'they are forgotten in time'
 
 
-def test_the_next_picture_tells_of_the_repeats(spool: Spool) -> None:
+def test_the_next_image_reports_the_repeats(spool: Spool) -> None:
     """What was sent cannot be changed: the first object with other content has the count, the key and the end."""
     put(spool, picture(0))
     put(spool, picture(1), picture(2))
@@ -102,7 +102,7 @@ def test_what_has_repeats_is_never_evicted(opened: Open, root: Path) -> None:
     assert_whole(root)
 
 
-def test_a_restart_stores_the_picture_anew(opened: Open, root: Path) -> None:
+def test_a_restart_stores_the_image_again(opened: Open, root: Path) -> None:
     """What another process stored is not known: one more object, and none is lost."""
     spool = opened()
     put(spool, picture(0))
@@ -121,7 +121,7 @@ def test_the_catalog_has_a_row_for_each_repeat(spool: Spool, root: Path) -> None
     assert [each.metadata['t_start_ns'] for each in found] == [str(picture(0).t_start_ns), str(picture(1).t_start_ns)]
 
 
-def test_a_repeat_is_not_asked_for(spool: Spool, root: Path) -> None:
+def test_a_repeat_cannot_be_requested(spool: Spool, root: Path) -> None:
     """``verify`` asks the store for what was delivered, and a repeat never was."""
     (item,) = put(spool, picture(0))
     put(spool, picture(1))

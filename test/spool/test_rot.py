@@ -92,7 +92,7 @@ def test_a_row_whose_text_is_damaged(opened: Open, root: Path) -> None:
     assert {item.key for item in spool.pending(9)} == {'a', 'b'}
 
 
-def test_a_ledger_that_does_not_close_is_told(opened: Open, root: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unbalanced_ledger_is_reported(opened: Open, root: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A total that was damaged in the index is said at every start, and costs nothing else."""
     spool = opened()
     put(spool, make('a'))

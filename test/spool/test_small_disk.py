@@ -55,7 +55,7 @@ def free(disk: Path) -> int:
     return os.statvfs(disk).f_bavail
 
 
-def test_a_disk_that_somebody_else_fills(root: Path, disk: Path, opened: Open) -> None:
+def test_a_disk_that_another_process_fills(root: Path, disk: Path, opened: Open) -> None:
     """The ballast lets the spool write down what it evicts, so that it keeps the newest even where nothing was free."""
     spool = opened(min_free_bytes=RESERVE)
     put(spool, make('event', bytes(MEBI), protected=True), *(make(f'{number}', bytes(MEBI)) for number in range(10)))

@@ -124,7 +124,7 @@ def test_quarantine_moves_the_file(spool: Spool, root: Path, reason: str | None,
     assert spool.pending(1) == []
 
 
-def test_quarantine_moves_the_file_while_somebody_reads(spool: Spool, root: Path) -> None:
+def test_quarantine_moves_a_file_that_is_being_read(spool: Spool, root: Path) -> None:
     """A question to the index that is half answered meanwhile, as a status is on a busy machine, does not hide the outcome."""
     (item,) = put(spool, make())
     half = spool._connections.reading._db.execute('SELECT * FROM tally')
@@ -150,7 +150,7 @@ def test_pending_order(spool: Spool) -> None:
     assert [item.key for item in spool.pending(2, oldest=True)] == ['a', 'b']
 
 
-def test_pending_leaves_out(spool: Spool) -> None:
+def test_pending_excludes_objects(spool: Spool) -> None:
     """Objects in hand and buckets that are shut do not use up the limit."""
     items = put(spool, *(make(str(number)) for number in range(6)), make('x', bucket='shut'))
     taken = {item.id for item in items[:4]}
@@ -158,7 +158,7 @@ def test_pending_leaves_out(spool: Spool) -> None:
     assert [item.key for item in spool.pending(9, exclude=taken, without=['shut', 'other'])] == ['4', '5']
 
 
-def test_nobody_else_may_read(spool: Spool, root: Path) -> None:
+def test_other_users_cannot_read(spool: Spool, root: Path) -> None:
     """Folders of the spool are 700 and its files 600."""
     put(spool, make(), make(held='clock'))
     mode = {path.relative_to(root).as_posix(): stat.S_IMODE(path.stat().st_mode) for path in [root, *root.rglob('*')]}
@@ -208,7 +208,7 @@ def test_accounts_survive_a_stop(opened: Open, root: Path) -> None:
     assert not list((root / 'sessions').iterdir())
 
 
-def test_numbers_go_on_after_a_stop(opened: Open, root: Path) -> None:
+def test_sequence_numbers_continue_after_a_stop(opened: Open, root: Path) -> None:
     """What a publisher sent between two sessions is missed by restart."""
     spool = opened()
     put(spool, make())
@@ -223,7 +223,7 @@ def test_numbers_go_on_after_a_stop(opened: Open, root: Path) -> None:
 
 
 @pytest.mark.parametrize('ends', [False, True])
-def test_numbers_go_on_apart_from_those_of_bag_record(opened: Open, *, ends: bool) -> None:
+def test_sequence_numbers_are_separate_from_bag_record(opened: Open, *, ends: bool) -> None:
     """What ``bag record`` hears beside a node, ended by now or not, counts neither for nor against the node's own bags."""
 
     def took(spool: Spool, *numbers: int) -> None:
@@ -269,7 +269,7 @@ def test_the_drain_lock_dies_with_its_process(spool: Spool, root: Path) -> None:
 
 
 @pytest.mark.long('two processes')
-def test_two_processes_add_at_once(opened: Open, root: Path) -> None:
+def test_two_processes_add_concurrently(opened: Open, root: Path) -> None:
     """Both get all of their objects in, whole and under keys of their own, whoever opens the spool meanwhile."""
     with started('add', root, 'one', 150) as one, started('add', root, 'two', 150) as two:
         for child in (one, two):

@@ -57,7 +57,7 @@ def test_a_fresh_status_is_that_of_a_running_node(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     'changes', [{'boot_id': 'another'}, {'ended': True}, {'pid': 2**22 + 1, 'boot_ns': NOON_NS - 6 * SECOND}]
 )
-def test_a_status_of_a_node_that_is_no_more(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_the_status_of_a_node_that_exited(tmp_path: Path, changes: dict[str, Any]) -> None:
     """Of another boot, of a clean end, or old and of a process that is gone: not running, and its figures are not shown."""
     written(tmp_path, topics={'/imu': {}}, **changes)
     found = read(tmp_path, 'thor', FakeClock())
@@ -132,7 +132,7 @@ def test_figures_that_another_version_does_not_write_have_defaults(tmp_path: Pat
     assert found.node.workers['intake'].failing is False
 
 
-def test_without_a_node_the_index_tells(tmp_path: Path) -> None:
+def test_without_a_node_the_index_is_read(tmp_path: Path) -> None:
     """What lies in the spool, how old the oldest object is, and when the last session began and ended."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
@@ -235,7 +235,7 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ),
     ],
 )
-def test_what_somebody_should_look_at(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:
+def test_findings_of_the_status(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:
     """Each loss and each fault of a running node is a finding."""
     written(tmp_path, **changes)
     assert finding in read(tmp_path, 'thor', FakeClock()).findings
@@ -263,7 +263,7 @@ def test_a_clock_that_is_not_set_is_a_finding(tmp_path: Path, words: str, *, gav
     assert f'the clock of this machine is not set: {words}' in read(tmp_path, 'thor', FakeClock()).findings
 
 
-def test_an_age_that_nobody_knows(tmp_path: Path) -> None:
+def test_an_unknown_age(tmp_path: Path) -> None:
     """What was spooled before the clock was set has not waited since 1970."""
     clock = FakeClock(60 * SECOND)
     spool = new_spool(tmp_path, clock)
@@ -276,7 +276,7 @@ def test_an_age_that_nobody_knows(tmp_path: Path) -> None:
     spool.close()
 
 
-def test_others_keep_to_what_the_node_was_told(tmp_path: Path) -> None:
+def test_other_processes_use_the_nodes_limits(tmp_path: Path) -> None:
     """The widest of several nodes' limits; where none has run, or an old one did not say, those of one's own."""
     assert limits(tmp_path, OWN) == OWN
     written(tmp_path, spool={'max_bytes': 9 << 20})

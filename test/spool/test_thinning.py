@@ -250,7 +250,7 @@ def test_a_slice_loses_pictures_alone(make_robot: Callable[..., Robot], tmp_path
     assert sum(int(str(row['samples'])) for row in lost) == 8 * 150 - sum(counts)
 
 
-def test_what_is_asked_for_or_protected_stays_as_it_is(make_robot: Callable[..., Robot]) -> None:
+def test_requested_and_protected_objects_are_not_thinned(make_robot: Callable[..., Robot]) -> None:
     """Thinning takes what nobody waits for, and leaves the rest whole."""
     robot = make_robot(1 << 20)
     robot.keep(archive(robot, 0), archive(robot, 1), archive(robot, 2))
@@ -266,7 +266,7 @@ def test_what_is_asked_for_or_protected_stays_as_it_is(make_robot: Callable[...,
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_an_hour_is_told_once(make_robot: Callable[..., Robot], caplog: pytest.LogCaptureFixture) -> None:
+def test_an_hour_of_thinning_is_one_gap_row(make_robot: Callable[..., Robot], caplog: pytest.LogCaptureFixture) -> None:
     """Where room is always short, what is new is thinned every few seconds, and the log does not say so each time."""
     caplog.set_level('INFO', 'shadowhound_data_logger')
     robot = make_robot(1 << 18)
@@ -291,7 +291,7 @@ def test_at_the_least_rate_the_oldest_goes(make_robot: Callable[..., Robot]) -> 
     assert_whole(robot.root)
 
 
-def test_the_catalog_is_told_of_each_step(make_robot: Callable[..., Robot]) -> None:
+def test_each_thinning_step_is_cataloged(make_robot: Callable[..., Robot]) -> None:
     """Also of an object that a part told of alone: it is told of again, with what is left of it."""
     robot, now_s = make_robot(1 << 20), [0.0]
     catalog = CatalogWriter(robot.root, CatalogSettings(), 'thor', robot.clock, lambda: now_s[0], keeps=True)

@@ -139,7 +139,7 @@ def test_what_is_listed_is_not_forgotten(opened: Open, root: Path, clock: FakeCl
     assert rows(root) == []
 
 
-def test_an_object_says_what_its_row_needs(spool: Spool) -> None:
+def test_an_object_has_the_columns_of_its_row(spool: Spool) -> None:
     """Sensor, topic, type, count and times are in the metadata of each, but no time of a clock that is not set."""
     (frame,) = put(spool, make('a', topic=None, type='', samples=0, sensor='missions', metadata={'robot': 'thor'}))
     assert {name: frame.metadata.get(name) for name in ('sensor', 'topic', 'count')} == {

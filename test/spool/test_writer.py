@@ -183,7 +183,7 @@ def test_a_thread_that_dies_in_a_commit(opened: Callable[..., SpoolWriter], spoo
     assert assert_whole(root)['objects']['pending'] == 1
 
 
-def test_outcomes_are_durable_before_they_are_told(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
+def test_outcomes_are_durable_before_they_are_reported(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
     """The uploader hears of a settled object only when its outcome is in the index."""
     settled: list[int] = []
     states: list[str] = []
@@ -271,7 +271,7 @@ def test_files_that_leave_make_way_for_a_commit(
     assert_whole(root)
 
 
-def test_whoever_settles_removes_files_meanwhile(
+def test_files_are_removed_while_outcomes_are_settled(
     opened: Callable[..., SpoolWriter], spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of what was settled before, so that the writer's thread can commit."""
@@ -341,7 +341,7 @@ def test_files_that_leave_make_room_before_anything_is_evicted(
     spool.close()
 
 
-def test_what_was_delivered_leaves_a_full_disk_first(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
+def test_delivered_files_are_removed_first_on_a_full_disk(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
                                                      disk_of: DiskOf) -> None:  # fmt: skip
     """A disk that is full of what was delivered has room for as much again: the spool does not wait for it for ever."""
     body = bytes(200_000)

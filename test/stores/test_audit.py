@@ -84,7 +84,7 @@ def test_what_was_delivered_is_there(store: ObjectStore, spooled: Spool, bucket:
     assert not list(spooled.root.glob('verify/*'))
 
 
-def test_the_catalogs_parts_are_not_asked_for(spooled: Spool) -> None:
+def test_an_audit_skips_parts_of_the_catalog(spooled: Spool) -> None:
     """They go once a larger part stands for them: one that is gone is not a finding, and none is counted."""
     store = MemoryStore()
     part = replace(make('thor/_catalog/date=2026-11-21/a.parquet'), sensor='_catalog', topic=None, samples=0)
@@ -139,7 +139,7 @@ def paged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures('paged')
 @pytest.mark.parametrize('error', [StoreUnavailable('away'), CredentialsRejected('wrong key')])
-def test_an_audit_that_was_cut_short_goes_on(spooled: Spool, error: StoreError) -> None:
+def test_an_interrupted_audit_resumes(spooled: Spool, error: StoreError) -> None:
     """A store that goes away is not a finding; the next run asks for the rest, for what came since, and for what was found."""
     store = MemoryStore()
     items = deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(45)))
@@ -159,7 +159,7 @@ def test_an_audit_that_was_cut_short_goes_on(spooled: Spool, error: StoreError) 
 
 
 @pytest.mark.usefixtures('paged')
-def test_another_audit_begins_anew(spooled: Spool) -> None:
+def test_another_audit_starts_again(spooled: Spool) -> None:
     """One that was cut short is forgotten on request, and by one that asks otherwise."""
     store = MemoryStore()
     deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(30)))

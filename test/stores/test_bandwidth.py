@@ -33,7 +33,7 @@ class Sender(threading.Thread):
             self.error = error
 
 
-def test_without_a_cap_a_body_leaves_at_once_in_large_pieces() -> None:
+def test_without_a_limit_a_body_is_sent_in_large_pieces() -> None:
     """Nothing of it is changed, and it is counted."""
     pace, body = Pace(), bytes(range(256)) * 1000
     pieces = list(pace.pieces(body, 5))
@@ -42,14 +42,14 @@ def test_without_a_cap_a_body_leaves_at_once_in_large_pieces() -> None:
     assert pace.sent_bytes == len(body)
 
 
-def test_a_file_leaves_whole_wherever_it_was_read_before() -> None:
+def test_a_file_is_sent_completely_from_any_position() -> None:
     """A signature reads the body first."""
     file = io.BytesIO(b'0123456789' * 1000)
     file.seek(0, io.SEEK_END)
     assert b''.join(Pace(800.0).pieces(file, 5)) == file.getvalue()
 
 
-def test_a_capped_body_leaves_evenly() -> None:
+def test_a_limited_body_is_sent_evenly() -> None:
     """In no span of time more than the cap allows for it, but for one piece and what a thread that woke late catches up."""
     pace = Pace(4.0)
     rate = 4.0 * BYTES_PER_MEGABIT
@@ -78,7 +78,7 @@ def test_a_cap_holds_for_all_bodies_together() -> None:
     assert pace.sent_bytes == 400_000
 
 
-def test_the_most_important_body_goes_first_and_starves_nobody() -> None:
+def test_priority_decides_without_starvation() -> None:
     """While it leaves, the others together get about each fourth piece: no less, or their servers would give them up."""
     pace, log = Pace(4.0), list[str]()
     others = [Sender(pace.pieces(bytes(2_000_000), 9), log, 'other') for _ in range(3)]
@@ -96,7 +96,7 @@ def test_the_most_important_body_goes_first_and_starves_nobody() -> None:
     assert 0.2 < share < 0.8
 
 
-def test_a_body_that_stands_back_goes_after_its_equals() -> None:
+def test_a_yielding_body_is_sent_after_its_equals() -> None:
     """A part of a slice that was there first gets no more beside a live object than each fourth piece."""
     pace, log = Pace(4.0), list[str]()
     part = Sender(pace.pieces(bytes(2_000_000), 5, is_background=True), log, 'part')
@@ -123,7 +123,7 @@ def test_of_bodies_alike_the_first_one_is_finished_first() -> None:
     assert until_first_ended.count('second') < 0.8 * until_first_ended.count('first')
 
 
-def test_a_new_cap_holds_at_once() -> None:
+def test_a_new_limit_applies_immediately() -> None:
     """For a body that waits under the old one, too."""
     pace = Pace(0.001)
     sender = Sender(pace.pieces(bytes(100_000), 5), [])
@@ -135,7 +135,7 @@ def test_a_new_cap_holds_at_once() -> None:
     assert pace.sent_bytes == 100_000
 
 
-def test_bodies_that_are_given_up_end_at_once_and_later_ones_do_not() -> None:
+def test_cancelled_bodies_end_immediately() -> None:
     """A stop does not wait for the cap; another drain of the same store is none of its business."""
     pace = Pace(0.001)
     senders = [Sender(pace.pieces(bytes(100_000), 5), []) for _ in range(3)]
@@ -150,7 +150,7 @@ def test_bodies_that_are_given_up_end_at_once_and_later_ones_do_not() -> None:
     assert b''.join(pace.pieces(b'later', 5)) == b'later'
 
 
-def test_how_much_leaves_in_a_while_is_known() -> None:
+def test_recent_throughput_is_measured() -> None:
     """Whoever plans with it gets a number in any case."""
     pace = Pace()
     assert pace.bytes_in(0.5) == float('inf')
@@ -168,7 +168,7 @@ def test_what_is_no_cap_is_refused(cap: float) -> None:
     assert repr(pace) == 'Pace(3 Mbit/s)'
 
 
-def test_a_cap_that_yields_ends_by_itself() -> None:
+def test_a_yielding_limit_expires() -> None:
     """For so long the lower of the two is in force, for bodies under way as well; then the cap is what it was."""
     now = [100.0]
     pace = Pace(8.0, lambda: now[0])

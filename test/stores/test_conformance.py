@@ -31,7 +31,7 @@ def test_what_was_put_is_got(store: ObjectStore, spool: Spool, bucket: str) -> N
     assert (type(read), read) == (bytes, content)
 
 
-def test_head_tells_size_type_and_metadata(store: ObjectStore, spool: Spool, bucket: str) -> None:
+def test_head_returns_size_type_and_metadata(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """The metadata make the round trip, the content's SHA-256 among them."""
     item = spool('a.pcd', b'points', content_type='application/vnd.pcd', metadata={'topic': '/point_cloud2', 'samples': '7'})
     store.put(item)
@@ -65,7 +65,7 @@ def test_sha256_is_kept_where_the_item_has_no_metadata(store: ObjectStore, spool
     assert info.sha256 == item.sha256
 
 
-def test_head_of_nothing_is_none(store: ObjectStore, spool: Spool, bucket: str) -> None:
+def test_head_of_a_missing_object_is_none(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """Neither a missing bucket, a missing key nor a folder is an object."""
     assert store.head(bucket, 'a') is None
     store.put(spool('a/b', b'x'))
@@ -99,7 +99,7 @@ def test_list_of_nothing_is_empty(store: ObjectStore, bucket: str) -> None:
     assert list(store.list(bucket)) == []
 
 
-def test_a_listing_tells_what_changes(store: ObjectStore, spool: Spool, bucket: str) -> None:
+def test_a_listing_detects_changes(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """Of each object a tag of its content and when it was stored."""
     store.put(spool('a', b'x'))
     (info,) = store.list(bucket)
@@ -118,7 +118,7 @@ def test_folders_are_the_names_right_below(store: ObjectStore, spool: Spool, buc
     assert list(store.folders(bucket, 'thor/none/')) == []
 
 
-def test_deleted_is_gone(store: ObjectStore, spool: Spool, bucket: str) -> None:
+def test_a_deleted_object_is_missing(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """With what was said of it; twice is not an error, and the key is free again."""
     store.put(spool('a/b', b'x'))
     for _ in range(2):

@@ -135,7 +135,7 @@ def test_half_a_pair_stops_the_start() -> None:
         Keys(dataclasses.replace(OWN, access_key_id='FIRST'))
 
 
-def test_no_network_is_asked_for_keys_to_a_server_of_ones_own(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_metadata_service_is_queried_for_credentials(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither the cloud's metadata service nor a container's, and so a start without keys takes no time."""
     monkeypatch.setenv('AWS_CONTAINER_CREDENTIALS_FULL_URI', 'http://127.0.0.1:1/keys')
     monkeypatch.setattr(InstanceMetadataProvider, 'load', lambda _: pytest.fail('the metadata service is asked'))
@@ -191,7 +191,7 @@ def test_keys_that_come_later(file: File, clock: list[float]) -> None:
     assert keys.get_frozen_credentials().access_key == 'KEY'
 
 
-def test_a_put_goes_on_with_new_keys(
+def test_a_put_resumes_with_new_keys(
     file: File, opened: Callable[..., S3Store], spool: Spool, seaweed: Tower, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip

@@ -151,9 +151,7 @@ def test_a_file_system_without_links(store: DirectoryStore, spool: Spool, bucket
 
 
 @pytest.mark.parametrize('record', ['[]', '{}', '7', '{"metadata": 7, "content_type": ""}', '{"metadata": {}}', '[' * 100_000])
-def test_a_record_that_is_none_tells_nothing(
-    store: DirectoryStore, spool: Spool, bucket: str, tmp_path: Path, record: str
-) -> None:
+def test_an_invalid_record_is_ignored(store: DirectoryStore, spool: Spool, bucket: str, tmp_path: Path, record: str) -> None:
     """Whoever wrote it: the object is there, known by its content alone, and can be listed, read and put again."""
     item = spool('a', b'first')
     store.put(item)

@@ -141,7 +141,7 @@ def test_an_upload_of_other_content_is_aborted(server: S3Store, item: SpooledObj
     assert under_way(server, bucket) == [f'{KEY}2'], 'another key is another matter'
 
 
-def test_a_key_that_is_taken_meanwhile(server: S3Store, item: SpooledObject, spool: Spool, bucket: str) -> None:
+def test_a_key_that_another_writer_took(server: S3Store, item: SpooledObject, spool: Spool, bucket: str) -> None:
     """Whoever wrote it while the parts were sent was first; ours leaves nothing behind."""
     theirs = spool(KEY, b'theirs')
     looks = []

@@ -10,7 +10,7 @@ from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.model import Put
 
 
-def test_it_fails_as_told_and_recovers(spool: Spool, bucket: str) -> None:
+def test_it_fails_on_request_and_recovers(spool: Spool, bucket: str) -> None:
     """The hook sees the item of a put and None for a probe; nothing is stored by a put that failed."""
     away = StoreUnavailable('away')
     store = MemoryStore(fail=lambda item: away if item is None or item.key == 'a' else None)

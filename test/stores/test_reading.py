@@ -30,7 +30,7 @@ def test_a_range_is_a_slice(store: ObjectStore, spool: Spool, bucket: str) -> No
         assert store.ranges(bucket, KEY, [(start, start + length)])[0] == CONTENT[start : start + length], (start, length)
 
 
-def test_ranges_come_in_the_order_that_they_were_asked_for_in(store: ObjectStore, spool: Spool, bucket: str) -> None:
+def test_ranges_arrive_in_the_requested_order(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """Several at once, some behind the end, some empty."""
     store.put(spool(KEY, CONTENT))
     end = len(CONTENT)
@@ -38,7 +38,7 @@ def test_ranges_come_in_the_order_that_they_were_asked_for_in(store: ObjectStore
     assert [bytes(each) for each in store.ranges(bucket, KEY, spans)] == [CONTENT[begin:stop] for begin, stop in spans]
 
 
-def test_content_tells_of_the_whole_object(store: ObjectStore, spool: Spool, bucket: str) -> None:
+def test_content_has_the_size_of_the_object(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """Wherever it begins: the size, and what was stored with it; it can be left unread."""
     item = spool('a', b'0123456789', metadata={'topic': '/x'})
     store.put(item)
@@ -83,7 +83,7 @@ def test_a_download_is_the_object(store: ObjectStore, spool: Spool, bucket: str,
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_download_goes_on_where_it_broke_off(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
+def test_an_interrupted_download_resumes(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
     """What lies there is not fetched again."""
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(CONTENT[: CHUNK_BYTES + 5])
@@ -94,9 +94,7 @@ def test_a_download_goes_on_where_it_broke_off(store: ObjectStore, spool: Spool,
 
 
 @pytest.mark.parametrize('there', [b'wrong', bytes(len(CONTENT)), CONTENT + b'more'])
-def test_a_download_of_wrong_bytes_is_begun_anew(
-    store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path, there: bytes
-) -> None:
+def test_a_corrupt_download_restarts(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path, there: bytes) -> None:
     """What does not fit is thrown away, as the caller is told, and fetched once more."""
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(there)
@@ -107,7 +105,7 @@ def test_a_download_of_wrong_bytes_is_begun_anew(
 
 
 @pytest.mark.parametrize('how', [{'size': 5}, {'sha256': '0' * 64}])
-def test_what_is_not_what_was_asked_for_is_no_file(
+def test_a_download_with_wrong_content_leaves_no_file(
     store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path, how: dict[str, Any]
 ) -> None:
     """Of another size or content than the caller knows: refused the second time, and nothing stays."""
@@ -143,7 +141,7 @@ def known(store: ObjectStore, bucket: str, key: str) -> str:
     return found[1]
 
 
-def test_an_object_that_changes_on_its_way_is_begun_anew(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
+def test_a_download_of_a_changed_object_restarts(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
     """Where a connection broke and another content is there meanwhile, none of the first one stays."""
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
@@ -171,7 +169,7 @@ class Short(MemoryStore):
         return Content(ObjectInfo(bucket, key, 10, None), iter([b'0123456789'[start : start + 4]]))
 
 
-def test_a_download_that_ends_early_goes_on(tmp_path: Path) -> None:
+def test_a_truncated_download_resumes(tmp_path: Path) -> None:
     """The store ends the content before its size: the next try asks for the rest alone, after a pause."""
     store, pauses = Short(), list[float]()
     found = download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', pause=pauses.append)
@@ -179,7 +177,7 @@ def test_a_download_that_ends_early_goes_on(tmp_path: Path) -> None:
     assert (store.asked, len(pauses), found.is_verified) == (3, 2, False)
 
 
-def test_a_store_that_stays_away_keeps_what_came(tmp_path: Path) -> None:
+def test_a_partial_download_survives_an_outage(tmp_path: Path) -> None:
     """So many tries, then the error; the next call goes on."""
 
     class Away(Short):

@@ -89,7 +89,7 @@ def test_bad_answers(answer: str, opened: Callable[..., S3Store], spool: Spool) 
         error_of(kind, store.probe)
 
 
-def test_the_store_recovers_by_itself(opened: Callable[..., S3Store], spool: Spool) -> None:
+def test_the_store_recovers_automatically(opened: Callable[..., S3Store], spool: Spool) -> None:
     """When the cause is gone the same store goes on."""
     with served(FakeS3(answer=(503, fake_s3.error('SlowDown')))) as server:
         store = opened(server.url)

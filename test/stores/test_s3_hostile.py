@@ -36,7 +36,7 @@ def answer(status: str, told: str, size: int) -> bytes:
     return f'{headers}Last-Modified: Sat, 21 Nov 2026 12:00:00 GMT\r\nConnection: close\r\n\r\n'.encode() + bytes(size)
 
 
-def test_a_range_takes_no_more_than_was_asked_for(opened: Callable[..., S3Store]) -> None:
+def test_a_range_reads_at_most_the_requested_bytes(opened: Callable[..., S3Store]) -> None:
     """A server that sends megabytes for ten bytes is refused."""
     sent = answer('206 Partial Content', 'bytes 0-9/100', MORE)
     with resetting(sent, reset=False) as url, pytest.raises(ObjectRefused, match='more than 10 bytes') as caught:
@@ -44,7 +44,7 @@ def test_a_range_takes_no_more_than_was_asked_for(opened: Callable[..., S3Store]
     assert caught.value.data['reason'] == 'size'
 
 
-def test_an_object_takes_no_more_than_was_said(opened: Callable[..., S3Store]) -> None:
+def test_an_object_reads_at_most_its_size(opened: Callable[..., S3Store]) -> None:
     """It says that it has ten bytes, and sends megabytes."""
     sent = answer('200 OK', 'bytes 0-9/10', MORE)
     with resetting(sent, reset=False) as url, pytest.raises(ObjectRefused, match='more than 10 bytes'):
@@ -58,7 +58,7 @@ def test_the_rest_of_an_object_comes_in_bounded_pieces() -> None:
         assert all(len(piece) <= 2 * CHUNK_BYTES for piece in content)
 
 
-def test_a_download_ends_where_more_comes_than_was_said(tmp_path: Path) -> None:
+def test_a_download_stops_at_the_announced_size(tmp_path: Path) -> None:
     """A store that never ends fills no disk."""
 
     class Endless(MemoryStore):
@@ -129,7 +129,7 @@ def pages(fails: int) -> Iterator[tuple[Pages, StoreSettings]]:
         server.server_close()
 
 
-def test_a_listing_goes_on_at_the_page_that_failed() -> None:
+def test_a_listing_resumes_at_the_failed_page() -> None:
     """Over a bad link a long listing would never end if it began anew each time."""
     with pages(fails=1) as (server, settings):
         found = Bucket(settings, 'camera').list('robot/')

@@ -98,9 +98,7 @@ def test_a_bucket_that_cannot_be_created(
     assert put() is Put.CREATED
 
 
-def test_a_refused_bucket_is_not_asked_for_by_each_object(
-    opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rejected_bucket_is_probed_once(opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Within the pause only the puts themselves ask; after it the next one tries to create it again."""
     with served(FakeS3(without_buckets=True)) as server:
         store = opened(server.url)
@@ -164,7 +162,7 @@ def test_nothing_shows_a_secret(opened: Callable[..., S3Store]) -> None:
     assert not re.search('Secret|url-password', text)
 
 
-def test_a_closed_store_says_so(opened: Callable[..., S3Store], spool: Spool) -> None:
+def test_a_closed_store_raises(opened: Callable[..., S3Store], spool: Spool) -> None:
     """Use after close is an error of the tree, not an AttributeError."""
     store = opened('http://127.0.0.1:1')
     store.close()

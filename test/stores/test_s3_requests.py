@@ -9,7 +9,7 @@ import sys
 import pytest
 
 
-def test_botocore_brings_no_pyopenssl() -> None:
+def test_botocore_does_not_import_pyopenssl() -> None:
     """Which it loads where the live page's extra has brought it, and does without as well."""
     pytest.importorskip('OpenSSL')
     program = (

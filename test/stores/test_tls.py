@@ -97,7 +97,7 @@ def test_a_certificate_that_is_not_believed(
 
 
 @pytest.mark.seaweedfs
-def test_delivery_goes_on_when_the_certificate_was_renewed(
+def test_delivery_resumes_after_the_certificate_was_renewed(
     authorities: dict[str, Authority], seaweed: Tower, through: Callable[[str], S3Store], spool: Spool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -138,7 +138,7 @@ def test_a_redirect_is_not_followed(
 
 
 @pytest.mark.parametrize('content', [None, 'no certificate'])
-def test_a_bundle_that_is_none_stops_the_start(content: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_ca_bundle_aborts_startup(content: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is named: with it nothing could be sent. Without https it does not matter."""
     path = tmp_path / 'ca.pem'
     if content:

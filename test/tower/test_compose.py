@@ -73,7 +73,7 @@ def test_servers_are_watched_and_come_back(services: dict[str, Any]) -> None:
     assert services['mlflow']['depends_on']['prepare']['condition'] == 'service_completed_successfully'
 
 
-def test_they_listen_where_they_are_told(services: dict[str, Any], tmp_path: Path) -> None:
+def test_servers_listen_on_the_configured_address(services: dict[str, Any], tmp_path: Path) -> None:
     """Ports are bound to TOWER_HOST, which is 127.0.0.1 until somebody names an address; the database has none."""
     ports = {name: service['ports'] for name, service in services.items() if 'ports' in service}
     assert set(ports) == {'s3', 'mlflow'}
@@ -256,7 +256,7 @@ def secured() -> dict[str, Any]:
     return found
 
 
-def test_with_tls_nothing_else_changes(services: dict[str, Any], secured: dict[str, Any]) -> None:
+def test_with_tls_only_the_scheme_changes(services: dict[str, Any], secured: dict[str, Any]) -> None:
     """The commands only grow, the one published port of the S3 server is that of https, and MLflow has no other than its own."""
     assert set(secured) == {'s3', 'mlflow'}
     for name, service in secured.items():

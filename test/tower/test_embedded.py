@@ -122,7 +122,7 @@ def test_two_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
 
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
-def test_it_leaves_nothing_but_its_folder(tmp_path: Path) -> None:
+def test_it_leaves_only_its_folder(tmp_path: Path) -> None:
     """After stop there is no process and no socket of it; stopping twice and starting twice is not an error."""
     tower = Tower(tmp_path)
     tower.start()
@@ -191,7 +191,7 @@ def test_a_server_dies_with_its_guard(tmp_path: Path) -> None:
     server.stop()
 
 
-def test_a_server_that_ends_at_once_shows_its_log(tmp_path: Path) -> None:
+def test_a_server_that_exits_immediately_shows_its_log(tmp_path: Path) -> None:
     """The error names the server, its exit code and the end of its log."""
     server = Server('a bad server', ['bash', '-c', 'echo the port is taken; exit 3'], log=tmp_path / 'log', environ=os.environ)
     server.start()

@@ -82,7 +82,7 @@ def test_an_older_folder_gets_what_it_lacks(tmp_path: Path) -> None:
     assert all((tmp_path / 'secrets' / value).is_file() for value in told.values())
 
 
-def test_a_machine_without_openssl_is_told_so(
+def test_a_missing_openssl_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing is left half made: the next run begins anew."""

@@ -128,7 +128,7 @@ def test_without_a_password_no_door_opens(users: dict[str, User], tower: Tower, 
 @pytest.mark.parametrize(
     'method', ['Bearer x', 'Basic', 'Basic !!!', 'Basic ' + base64.b64encode(b'tower').decode(), 'Digest username=tower']
 )
-def test_half_a_login_is_none(tower: Tower, users: dict[str, User], method: str) -> None:
+def test_an_incomplete_login_is_rejected(tower: Tower, users: dict[str, User], method: str) -> None:
     """Whatever else may be in the header."""
     for path in ('/api/2.0/mlflow/experiments/search', '/api/2.0/mlflow-artifacts/artifacts/1/a', '/ajax-api/3.0/jobs/search'):
         answer = users[''].http.request('GET', tower.tracking_uri + path, headers={'Authorization': method}, timeout=60)
@@ -187,7 +187,7 @@ def test_a_robot_logs_its_own_missions(users: dict[str, User], run: dict[str, An
     assert thor.send('GET', _artifact(run)).data == b'frame'
 
 
-def test_a_robot_does_nothing_else(users: dict[str, User], run: dict[str, Any]) -> None:
+def test_a_robot_creates_and_deletes_nothing(users: dict[str, User], run: dict[str, Any]) -> None:
     """It makes and deletes no experiment, run, model, artifact, user or trace, by none of the paths; not even its own."""
     thor, experiment, run_id = users['thor'], run['experiment_id'], run['run_id']
     tried = [
@@ -221,7 +221,7 @@ def test_a_robot_does_nothing_else(users: dict[str, User], run: dict[str, Any]) 
     assert users['tower'].call('GET', f'runs/get?run_id={run_id}')['run']['info']['lifecycle_stage'] == 'active'
 
 
-def test_a_robot_is_nobody_in_anothers_experiment(users: dict[str, User], run: dict[str, Any]) -> None:
+def test_a_robot_has_no_access_to_anothers_experiment(users: dict[str, User], run: dict[str, Any]) -> None:
     """It neither reads nor writes there, nor by a path that leads out of its own artifacts."""
     tachi, experiment, run_id = users['tachi'], run['experiment_id'], run['run_id']
     own = tachi.experiment('tachi_missions')
@@ -297,7 +297,7 @@ PLACES = ['file:///etc', '/etc', 'file:/etc', 'FILE:///etc', 'sftp://localhost/e
 
 
 @pytest.mark.parametrize('user', ['spark', pytest.param('tower', marks=pytest.mark.long('as for spark'))])
-def test_nobody_chooses_where_artifacts_go(users: dict[str, User], user: str) -> None:
+def test_no_user_chooses_the_artifact_location(users: dict[str, User], user: str) -> None:
     """Neither by the field's name in the protocol nor by that in JSON, on none of the paths, and nothing is made."""
     bodies = [{'name': f'{user}-{number}', field: place} for number, place in enumerate(PLACES)
               for field in ('artifact_location', 'artifactLocation')]  # fmt: skip
@@ -349,7 +349,7 @@ def test_spark_looks_at_missions_and_keeps_its_own(users: dict[str, User], run: 
     spark.call('POST', 'experiments/delete', {'experiment_id': own})
 
 
-def test_a_second_password_counts_at_once(users: dict[str, User], tower: Tower, tmp_path: Path) -> None:
+def test_a_second_password_is_valid_immediately(users: dict[str, User], tower: Tower, tmp_path: Path) -> None:
     """And a retired one no more: the server reads its users anew, nothing is restarted, nothing stops while both are there."""
     old, new = 'the old one', 'the new one'
     file = next(tower._folder.glob('mlflow/users.json'))
@@ -405,7 +405,7 @@ class Neighbor:
             connection.close()
 
 
-def test_whoever_guesses_has_to_wait_and_nobody_else(tower: Tower) -> None:
+def test_only_an_address_that_guesses_must_wait(tower: Tower) -> None:
     """After some wrong passwords an address gets no answer to the right one either; other addresses do."""
     password = tower.tracking('spark')['MLFLOW_TRACKING_PASSWORD']
     guesser, other = Neighbor(tower, '127.0.9.1'), Neighbor(tower, '127.0.9.2')
@@ -476,7 +476,7 @@ for one in fastapi_app.create_fastapi_app(app).routes:
 
 
 @pytest.mark.long('imports all of MLflow')
-def test_no_route_beside_flask_opens(users: dict[str, User]) -> None:
+def test_routes_outside_flask_are_closed(users: dict[str, User]) -> None:
     """Each that this version has is refused to strangers, robots and Spark, however a robot spells its path."""
     routes = _asgi_routes()
     assert {'/v1/traces', '/gateway/proxy/{endpoint_name}/{path:path}'} < {path for _, path in routes}
@@ -499,7 +499,7 @@ def test_no_route_beside_flask_opens(users: dict[str, User]) -> None:
 
 
 @pytest.mark.parametrize('name', ['', 'thor', 'spark'])
-def test_nobody_has_the_server_fetch_an_address(users: dict[str, User], name: str) -> None:
+def test_no_user_can_make_the_server_fetch_a_url(users: dict[str, User], name: str) -> None:
     """No webhook, no gateway's secret or endpoint, no scorer: whatever would have the server ask another one is refused."""
     url = 'http://169.254.169.254/latest/meta-data/'
     asked = [

@@ -117,7 +117,7 @@ def towers(tmp_path: Path) -> Iterator[Towers]:
         yield found
 
 
-def test_a_tower_is_moved_as_the_manual_says(towers: Towers) -> None:
+def test_a_tower_is_moved_as_documented(towers: Towers) -> None:
     """All of every object arrives, once; what robots send to the new one meanwhile stays; what the new one loses is named."""
     towers.copy()
     new = client(towers.new)

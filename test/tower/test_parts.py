@@ -151,7 +151,7 @@ def test_an_upload_of_other_content_is_aborted(
     assert under_way(as_user('tower'), key) == []
 
 
-def test_uploads_of_others_are_none_of_its_business(as_user: Callable[[str], Any]) -> None:
+def test_uploads_of_others_are_ignored(as_user: Callable[[str], Any]) -> None:
     """It can neither take part in them nor see their parts nor end them."""
     tachi, thor, key = as_user('tachi'), as_user('thor'), 'tachi/rosbags/a.mcap'
     upload = tachi.create_multipart_upload(Bucket='sensor-data', Key=key)['UploadId']

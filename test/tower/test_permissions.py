@@ -144,7 +144,7 @@ def test_training_sets_are_sparks(as_user: Connect) -> None:
     assert 'Contents' not in spark.list_objects_v2(Bucket='lerobot', Prefix=key)
 
 
-def test_policies_are_read_by_robots_and_nothing_else_there(as_user: Connect) -> None:
+def test_robots_read_only_policies_there(as_user: Connect) -> None:
     """A robot gets each object below policies, and neither lists, writes nor deletes there, nor sees what is beside it."""
     spark, thor, key = as_user('spark'), as_user('thor'), 'policies/go2/go2_patrol_v7/manifest.json'
     for name in (key, 'policies_of_others/x', 'datasets/x'):
@@ -288,7 +288,7 @@ class _Ignoring:
 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize(('makes', 'says'), [(False, 'does not apply If-Match'), (True, 'MinIO')])
-def test_the_doctor_tells_a_server_that_ignores_if_match(makes: bool, says: str) -> None:
+def test_the_doctor_detects_a_server_that_ignores_if_match(makes: bool, says: str) -> None:
     """Or that makes what is not there."""
     (found,) = race_mailboxes(_Ignoring(makes=makes))  # type: ignore[arg-type]
     assert found.is_finding
@@ -331,7 +331,7 @@ def test_no_url_outlives_a_robots_keys(
 
 
 @pytest.mark.parametrize('how', ['put', 'copy', 'parts'])
-def test_a_robot_hides_no_object_behind_a_key_of_its_own(as_user: Connect, how: str) -> None:
+def test_a_robot_cannot_encrypt_with_its_own_key(as_user: Connect, how: str) -> None:
     """With SSE-C nothing is stored, and what the server encrypts with its own key is read by Spark."""
     thor, where = as_user('thor'), {'Bucket': 'sensor-data', 'Key': f'thor/camera/hidden-{how}.txt'}
     thor.put_object(Bucket='sensor-data', Key='thor/camera/plain.txt', Body=b'plain', ServerSideEncryption='AES256')
@@ -400,7 +400,7 @@ def test_a_robot_that_is_over_its_quota_stores_nothing_more(server: Tower, as_us
 
 
 @pytest.mark.parametrize('text', ['', 'thor', 'thor=', '=5', 'thor=-1', 'thor=1e3', '../x=5', 'thor=nan'])
-def test_a_quota_that_is_none_is_refused(text: str) -> None:
+def test_an_invalid_quota_is_rejected(text: str) -> None:
     """With what it should look like."""
     with pytest.raises(ArgumentTypeError, match='such as thor=500'):
         prepare.quota_of(text)

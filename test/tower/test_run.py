@@ -100,7 +100,7 @@ def _mlflow_processes(offset: int) -> list[Path]:
             if b'--port' in (words := _words(entry)) and port in words and b'_guard.py' not in b' '.join(words)]  # fmt: skip
 
 
-def test_mlflow_is_nobody_of_importance(folder: Path, offset: int) -> None:
+def test_mlflow_runs_unprivileged(folder: Path, offset: int) -> None:
     """Its processes are not root's, whoever runs the Tower, and not those of a user whom another service runs as."""
     servers = _mlflow_processes(offset)
     assert servers

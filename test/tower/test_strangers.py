@@ -280,7 +280,7 @@ def _lifecycle_deletes(target: Running) -> str:
     return status
 
 
-def test_the_lifecycle_deletes_for_nobody_else(opened: Running, closed: Running) -> None:
+def test_the_lifecycle_api_requires_keys(opened: Running, closed: Running) -> None:
     """It takes an object away where there are no keys; with them the object is there afterwards."""
     assert _lifecycle_deletes(opened) == 'OK'
     with pytest.raises(ClientError):
@@ -349,7 +349,7 @@ WEB: Final = {
 }  # fmt: skip
 
 
-def test_the_web_gives_nothing_away(opened: Running, closed: Running) -> None:
+def test_the_web_interface_reveals_nothing(opened: Running, closed: Running) -> None:
     """What serves everybody by HTTP where there are no keys refuses here; a volume server refuses every object by its number."""
     for name, (server, method, path) in WEB.items():
         assert _status(opened, server, method, path) < 400, name

@@ -63,7 +63,7 @@ def test_another_writers(tmp_path: Path, options: dict[str, bool]) -> None:
 
 
 @pytest.mark.parametrize('content', [b'', b'no bag', b'\x89MCAP0\r\n' * 30])
-def test_no_whole_file(tmp_path: Path, content: bytes) -> None:
+def test_an_incomplete_file(tmp_path: Path, content: bytes) -> None:
     """What was cut off, or is something else, is named."""
     path = tmp_path / 'bag_0.mcap'
     path.write_bytes(content)

@@ -144,7 +144,7 @@ def test_a_tail_of_anything(tmp_path: Path, opened: bytes, tail: bytes) -> None:
 
 
 @pytest.mark.parametrize('content', [b'', b'\x89MCAP', bytes(100), b'no bag at all' * 50])
-def test_nothing_whole(tmp_path: Path, content: bytes) -> None:
+def test_a_file_without_intact_chunks(tmp_path: Path, content: bytes) -> None:
     """A file without one whole chunk becomes an empty slice."""
     assert recovered(tmp_path, content).messages == 0
 

@@ -88,7 +88,7 @@ def test_a_sync_leaves_nothing_in_memory(tmp_path: Path) -> None:
     assert in_order(recover(tmp_path / 'bag_0.mcap.open').path) == written
 
 
-def test_a_chunk_ends_by_itself(tmp_path: Path) -> None:
+def test_a_chunk_ends_automatically(tmp_path: Path) -> None:
     """No chunk has more bytes than it may have, but for a single message that is larger."""
     writer = SliceWriter(tmp_path / 'bag_0.mcap', compression='none', chunk_bytes=1000)
     written = fill(writer, messages(40, size=100))
@@ -119,7 +119,7 @@ def test_what_does_not_shrink_is_left_alone(tmp_path: Path) -> None:
     assert [one.cdr for one in indexed(info.path)] == [noise, bytes(20_000)]
 
 
-def test_stamps_that_are_none(tmp_path: Path) -> None:
+def test_invalid_stamps(tmp_path: Path) -> None:
     """A publisher's stamp that is not known is the log time, a time before 1970 is 1970, a sequence wraps."""
     writer = SliceWriter(tmp_path / 'bag_0.mcap')
     writer.write(TALK, 50, 0, (1 << 32) + 7, b'1234')

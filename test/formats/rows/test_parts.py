@@ -128,7 +128,7 @@ BAD: dict[str, tuple[bytes, str]] = {
 }  # fmt: skip
 
 
-def test_a_newer_robots_columns_are_left_out_and_counted() -> None:
+def test_unknown_columns_are_skipped_and_counted() -> None:
     """Its rows are used."""
     found = parts.read_rows(compress(line(color='red', shape={'a': [1]}) + line()), 'thor')
     assert found.rows == {'_catalog': some(1) * 2}

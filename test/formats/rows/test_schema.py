@@ -26,7 +26,7 @@ def row(metadata: dict[str, str], key: str = CAMERA, bucket: str = 'sensor-data'
     return schema.row_of(bucket, key, 50_000, 'image/jpeg', metadata)
 
 
-def test_a_row_has_all_that_the_object_says() -> None:
+def test_a_row_has_all_metadata_of_the_object() -> None:
     """Each column has its value, in the order of the columns."""
     found = row(TOLD)
     assert list(found) == list(schema.COLUMNS)
@@ -41,7 +41,7 @@ def test_a_row_has_all_that_the_object_says() -> None:
     }  # fmt: skip
 
 
-def test_what_is_not_said_is_null() -> None:
+def test_missing_metadata_is_null() -> None:
     """A foreign object has robot and sensor by its key, its size, and nothing else."""
     found = row({})
     known = {name for name, value in found.items() if value is not None}
@@ -50,14 +50,14 @@ def test_what_is_not_said_is_null() -> None:
 
 
 @pytest.mark.parametrize('pose', ['', '1 2', '1 2 3', '1 2 x odom', '1 2 nan odom', '1 2 inf odom', '1 2 3 a b'])
-def test_half_a_pose_is_none(pose: str) -> None:
+def test_an_incomplete_pose_is_null(pose: str) -> None:
     """Where any of it is missing or no number, all of it is null."""
     found = row({**TOLD, 'pose': pose})
     assert [found[name] for name in ('x', 'y', 'yaw', 'pose_frame')] == [None] * 4
 
 
 @pytest.mark.parametrize('gps', ['', '1 2', '91 2 3', '1 181 3', '1 nan 3', 'inf 2 3', '1 2 3 4', 'x 2 3'])
-def test_what_is_no_place_on_earth_is_none(gps: str) -> None:
+def test_an_invalid_position_is_null(gps: str) -> None:
     """Whatever a foreign object says; a place whose altitude is unknown is one."""
     found = row({**TOLD, 'gps': gps})
     assert [found[name] for name in ('latitude', 'longitude', 'altitude')] == [None] * 3

@@ -68,7 +68,7 @@ def talk(*cdrs: bytes, sensor: str = 'talk') -> Batch:
     )
 
 
-def test_good_and_bad_samples_are_told_apart() -> None:
+def test_valid_samples_are_stored_and_invalid_ones_rejected() -> None:
     """The good ones of a batch are in its object, the bad ones are counted by reason."""
     outcome = Outcome()
     outcome.pool.open()
@@ -79,7 +79,7 @@ def test_good_and_bad_samples_are_told_apart() -> None:
     assert [item.key.split('/')[:2] for item in outcome.objects] == [['thor', 'talk']]
 
 
-def test_what_is_wrong_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_encoder_error_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     """The first rejected message of a topic and reason is told to the operator in words, the others are only counted."""
     outcome = Outcome(threads=1)
     outcome.queue.put(talk(b'bad', b'bad'), 5)
@@ -137,7 +137,7 @@ def test_close_encodes_what_is_queued() -> None:
     assert outcome.samples == 200
 
 
-def test_an_encoder_with_a_fault_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_encoder_with_a_bug(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its samples are rejected as encoder_failed, the failure is counted, and the others are encoded all the same."""
     outcome, encode = Outcome(threads=1), pool_module.encode
 
@@ -181,7 +181,7 @@ def test_a_thread_that_dies(monkeypatch: pytest.MonkeyPatch, death: BaseExceptio
     assert outcome.queue.status().finished == 2
 
 
-def test_a_close_that_takes_too_long_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_close_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """A writer that blocks is not waited for longer than told."""
     outcome, entered, blocked = Outcome(threads=1), threading.Event(), threading.Event()
 

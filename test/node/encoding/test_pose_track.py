@@ -174,7 +174,7 @@ def test_a_clock_that_steps_begins_a_new_track() -> None:
 
 
 @pytest.mark.parametrize('cdr', [b'', b'\x00\x01\x00\x00', odometry(math.nan, 0, 0), odometry(0, 0, 0)[:60]])
-def test_odometry_that_cannot_be_read_is_left_out(cdr: bytes) -> None:
+def test_unreadable_odometry_is_skipped(cdr: bytes) -> None:
     """It spoils no object."""
     assert pose(walking([(0.0, cdr), (0.1, cdr)]), 0.05) is None
 
@@ -270,7 +270,7 @@ def test_other_fields_of_a_battery_state_are_as_they_are() -> None:
     assert marked(found, 0.0)['battery_pct'] == '28.5'
 
 
-def test_only_what_is_asked_for_is_kept() -> None:
+def test_only_requested_topics_are_kept() -> None:
     """Of other topics, of odometry that is none and with empty settings there is no track, and objects stay as they are."""
     found = robot()
     assert found.of('/odom', CHARGE) is None

@@ -41,7 +41,7 @@ def minute() -> Minute:
     return Minute()
 
 
-def test_the_first_one_at_once_the_others_each_minute(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_first_rejection_is_logged_immediately_others_each_minute(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
     """A driver whose messages are all rejected costs a line a minute, with the number of messages since the last."""
     for _ in range(180):
         minute.reject(10)
@@ -66,7 +66,7 @@ def test_what_came_after_the_last_report_is_not_forgotten(minute: Minute, caplog
     ]  # fmt: skip
 
 
-def test_topics_reasons_and_nodes_are_told_apart(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
+def test_rejections_are_logged_by_topic_reason_and_node(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
     """Each pair has its own minute; two publishers of one node are one, and a node is looked up once."""
     for publisher in ('gid1', 'gid2', 'gid3', 'gone', '', 'gid1'):
         minute.reject(publisher=publisher)

@@ -106,7 +106,7 @@ def test_the_map_counts_before_odometry() -> None:
     assert robot.pose(1.0) == (7.0, 7.0, 0.0, 'odom')
 
 
-def test_a_map_that_is_gone() -> None:
+def test_an_outdated_map_is_not_used() -> None:
     """Where localization stopped, the pose is that of odometry again: in its own frame."""
     robot = walking(Robot(), 1.0)
     for number in range(21, 200):

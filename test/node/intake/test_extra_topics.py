@@ -106,9 +106,7 @@ def test_topics_that_no_setting_names_are_few(
     assert recording.bags.topics == {source.topic for source in recording.extra.own}
 
 
-def test_what_nobody_publishes_any_more_gives_its_place_away(
-    robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_abandoned_topic_frees_its_place(robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     """A while after its publisher a subscription goes, and another topic is taken."""
     monkeypatch.setattr(module, 'MAX_FOUND', 1)
     (first,) = crowd(robot, '/crowd/a')
@@ -156,6 +154,6 @@ def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: 
 @pytest.mark.parametrize(
     'name', ['/%s%n', '/1digit', '//double', '/{curly}~', '/a b', '/a\x1b]0;owned\x07', '/ä', 'relative', '/a' * 150]
 )
-def test_names_that_are_none_of_ros(name: str) -> None:
+def test_names_that_are_invalid_in_ros(name: str) -> None:
     """A program without ROS may have any; an expression that matches it takes the other topics."""
     assert TopicChoice(BagSettings(regex='.*'), ()).wanted((), [name, '/good']) == {'/good'}

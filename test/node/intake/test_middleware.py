@@ -85,7 +85,9 @@ def test_a_fast_dds_robot_keeps_its_own(installed: dict[str, str], rmw: str) -> 
     ('name', 'value'), [('FASTDDS_DEFAULT_PROFILES_FILE', '/mine.xml'), ('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')]
 )
 @pytest.mark.parametrize('robot', [{}, CYCLONE])
-def test_what_the_operator_told_fast_dds_holds(installed: dict[str, str], name: str, value: str, robot: dict[str, str]) -> None:
+def test_the_operators_fast_dds_settings_are_kept(
+    installed: dict[str, str], name: str, value: str, robot: dict[str, str]
+) -> None:
     """His profile, his transports and the range of his variables, on either robot."""
     environ = {**installed, **robot, name: value, 'ROS_LOCALHOST_ONLY': '1'}
     found = choose('auto', environ)
@@ -133,7 +135,7 @@ def test_where_it_is_not_as_good_the_robots_own_is_taken(
     assert why in found.describe()
 
 
-def test_what_is_asked_for_is_done_or_refused(installed: dict[str, str], tmp_path: Path) -> None:
+def test_a_requested_rmw_is_used_or_rejected(installed: dict[str, str], tmp_path: Path) -> None:
     """The robot's own on request; Fast DDS also where nobody has measured it, but not where it cannot hear."""
     assert choose('robot', {**installed, **CYCLONE}).rmw == 'rmw_cyclonedds_cpp'
     new = prefix(tmp_path / 'new', {'rmw_fastrtps_cpp': '99.1.0'})

@@ -112,7 +112,7 @@ def test_what_is_skipped_is_at_no_time_open(given: dict[str, bool], settings: di
     assert commits.open == [still_open]
 
 
-def test_what_nobody_asked_for_is_skipped() -> None:
+def test_unwanted_messages_are_skipped() -> None:
     """Outside of a mission messages are counted as skipped, and those that a pause drops as dropped."""
     talk = Talk()
     for idle in (True, False, True):
@@ -131,7 +131,7 @@ def test_a_pause_wins_over_the_rate() -> None:
     assert talk.kept() == [10]
 
 
-def test_another_rate_leaves_the_open_batch() -> None:
+def test_a_changed_rate_keeps_the_open_batch() -> None:
     """The rate changes from one message to the next, and what is in the open batch stays in it."""
     talk = Talk(rate_hz=1.0)
     talk.add(talk.messages(15))
@@ -214,7 +214,7 @@ def test_a_declared_rate_needs_no_learning() -> None:
     assert (talk.account.accounting, talk.account.missed_estimated) == (ESTIMATED, 5)
 
 
-def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wrong_expected_rate_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     """Messages that come more often refute it: their rhythm is learned."""
     talk = Talk(expected_hz=4.0)
     talk.senders.poll(['a'])
@@ -223,7 +223,7 @@ def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFix
     assert [record.getMessage().partition(':')[0] for record in caplog.records] == [TOPIC]
 
 
-def test_a_counter_that_cannot_be_read_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unreadable_counter_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     """Stamps are used then."""
     talk = Talk(counter='data')
     talk.senders.poll(['a'])
@@ -325,7 +325,7 @@ def test_a_consumer_that_raises_keeps_no_other_from_its_messages(where: str, sai
     assert 'Broken failed to take messages of /talk (1 times so far)' in record.message
 
 
-def test_what_a_sampler_fails_to_choose_is_dropped_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_of_a_failing_sampler_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its messages are not open until the node ends, with the journal complete beyond them."""
     talk, last = Talk(), Drains()
     talk.listen(talk.sampler, last)
@@ -381,7 +381,7 @@ def test_the_journal_is_complete_up_to_what_has_an_outcome() -> None:
     (NOON_NS - 2 * DAY_NS, NOON_NS, {'sent_too_old': 1}), (NOON_NS + 2 * DAY_NS, NOON_NS, {'sent_ahead': 1}),
     (60 * SECOND, NOON_NS, {'sent_before_2024': 1}), (NOON_NS - DAY_NS // 2, NOON_NS, {'sent_erratic': 1}),
 ])  # fmt: skip
-def test_nobody_in_the_network_dates_a_loss(sent_ns: int, dated_ns: int, why: dict[str, int]) -> None:
+def test_forged_stamps_do_not_date_losses(sent_ns: int, dated_ns: int, why: dict[str, int]) -> None:
     """A gap before a message with a forged time of sending is dated by its arrival, and the message is counted by reason."""
     talk = Talk()
     talk.add([Taken(b'1', NOON_NS - SECOND, 'p', 1, NOON_NS - SECOND), Taken(b'5', sent_ns, 'p', 5, NOON_NS)])

@@ -36,7 +36,7 @@ class Robot:
         return None if rows is None else {topic: row.text for topic, row in rows.items()}
 
 
-def test_it_is_said_after_a_while_and_ends_when_it_is_heard(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unheard_publisher_is_reported_until_it_is_found(caplog: pytest.LogCaptureFixture) -> None:
     """Once in the log, with topic, node, both RMWs and what to do; and that it is over."""
     caplog.set_level(logging.INFO)
     robot = Robot(imu=IMU)
@@ -58,7 +58,7 @@ def test_it_is_said_after_a_while_and_ends_when_it_is_heard(caplog: pytest.LogCa
 
 
 @pytest.mark.parametrize('of', ['their ghost', 'a stop of ours', 'restarts'])
-def test_what_does_not_last_is_not_said(of: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_short_difference_is_not_reported(of: str, caplog: pytest.LogCaptureFixture) -> None:
     """A publisher that was killed lingers; while this process was stopped nobody compared; each publisher counts for itself."""
     robot = Robot(imu=IMU)
     robot.theirs = {'/imu': [['aa', IMU, '']]}
@@ -80,7 +80,7 @@ def test_what_does_not_last_is_not_said(of: str, caplog: pytest.LogCaptureFixtur
     assert not caplog.records
 
 
-def test_nothing_is_known_while_nobody_reports() -> None:
+def test_without_reports_nothing_is_known() -> None:
     """Before the first report, and when the front has gone."""
     robot = Robot(imu=IMU)
     assert robot.texts is None
@@ -107,13 +107,13 @@ def test_only_what_would_be_logged_counts() -> None:
 
 
 @pytest.mark.parametrize('wrong', [7, {'a': 1}, [7], [['aa']], [['aa', 'b', 7]], [[['aa'], 'b', 'c']]])
-def test_a_report_that_is_none_is_no_error(wrong: Any) -> None:
+def test_an_invalid_report_is_ignored(wrong: Any) -> None:
     """Whoever has the control socket may send what he likes."""
     robot = Robot(imu=IMU)
     assert robot.unheard.compare({'/imu': wrong}) == {'topics': ['/imu'], 'gids': []}
 
 
-def test_the_front_is_told_what_is_known_already() -> None:
+def test_the_front_learns_the_known_publishers() -> None:
     """So that a report has only what is beyond that, and is short."""
     robot = Robot(imu=IMU, odom='')
     robot.ours = {'/imu': {'bb', 'aa'}, '/odom': {'cc'}}

@@ -47,7 +47,7 @@ def frame(body: bytes, content_type: str = 'image/jpeg', after_s: float = 0.0, *
     (pack_zip([ArchiveFile('1.json', NOON_NS, b'{}'), ArchiveFile('1.jpg', NOON_NS, picture())]), 'application/zip'),
     (pack_tar([ArchiveFile('1.jpg', NOON_NS, picture()), ArchiveFile('1.json', NOON_NS, b'{}')]), 'application/x-tar'),
 ])  # fmt: skip
-def test_a_preview_is_small_and_says_of_what(body: bytes, content_type: str) -> None:
+def test_a_preview_is_small_and_names_its_original(body: bytes, content_type: str) -> None:
     """A JPEG of at most 5 KB, with the place of the picture; it is bookkeeping, and does not stay on the robot itself."""
     keeper = keeping()
     kept = keeper.mark(frame(body, content_type))
@@ -79,7 +79,7 @@ def test_a_preview_a_second() -> None:
     lambda: picture('TIFF', 'F'),
 ], ids=['no picture', 'cut off', 'cut archive', 'depth'])  # fmt: skip
 @pytest.mark.parametrize('content_type', ['image/jpeg', 'application/zip', 'application/x-tar'])
-def test_what_cannot_be_shown_has_none(make_body: Callable[[], bytes], content_type: str) -> None:
+def test_an_object_without_an_image_has_no_preview(make_body: Callable[[], bytes], content_type: str) -> None:
     """And is kept all the same."""
     keeper = keeping()
     kept = keeper.mark(frame(make_body(), content_type))

@@ -52,7 +52,7 @@ def test_no_network(interfaces: Path, tmp_path: Path) -> None:
     assert wifi_networks(tmp_path / 'none') == set()
 
 
-def test_a_system_that_does_not_tell(interfaces: Path) -> None:
+def test_an_unknown_network_has_a_reason(interfaces: Path) -> None:
     refused = OSError(95, 'Operation not supported')
     found = wifi_networks(interfaces, Kernel({'wlan0': refused, 'wlan1': refused}))
     assert found == 'the system does not report the network of wlan1: Operation not supported'
@@ -60,11 +60,11 @@ def test_a_system_that_does_not_tell(interfaces: Path) -> None:
     assert isinstance(wifi_networks(interfaces / 'nowhere'), str)
 
 
-def test_this_machine_tells_or_says_why() -> None:
+def test_networks_of_this_machine() -> None:
     assert wifi_networks() is not None
 
 
-def test_a_rule_about_a_topic_that_nobody_publishes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rule_that_waits_for_an_unpublished_topic_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """After a minute, with what to do; not before, and not once somebody publishes it."""
     now_s, publishers = [1000.0], {'/lowstate': 0}
     monkeypatch.setattr(upload_rules, 'time', SimpleNamespace(monotonic=lambda: now_s[0]))

@@ -36,7 +36,7 @@ def test_an_older_bag_is_not_taken_for_ours(tmp_path: Path) -> None:
     assert _writer(tmp_path, older).manifest_of(ours.bag) is None
 
 
-def test_a_bag_is_known_by_its_beginning_where_the_clock_was_set_meanwhile(tmp_path: Path) -> None:
+def test_a_bag_is_found_after_the_clock_was_set(tmp_path: Path) -> None:
     """It has another name then, and its manifest says when it began."""
     began_as = unsynced_name('patrol', 'b-boot', 12 * SECOND, lambda _: False)
     ours = _manifest('patrol_20251018_120000', clock=ClockOf('set_later', 'b-boot', 12 * SECOND + 5, 7, 8))

@@ -122,7 +122,7 @@ def test_repeats_without_a_sender_are_dropped(ear: Ear) -> None:
     assert ear.heard() == [1, 2, 3]
 
 
-def test_a_bag_is_told_what_the_rhythm_says(ear: Ear) -> None:
+def test_estimated_losses_are_in_the_manifest(ear: Ear) -> None:
     """What came before it was known stays unknown; what is lost after that is estimated, by the same rhythm as the sensor's."""
     senders = Senders()
     senders.poll(['a'])

@@ -101,7 +101,7 @@ def test_a_pause_keeps_nothing() -> None:
     assert ear.claims.lost == [(PAUSED, [3, 4])]
 
 
-def test_what_an_event_asked_for_and_has_to_go_is_told() -> None:
+def test_event_messages_dropped_from_the_ring_are_reported() -> None:
     """Only then: without an event the oldest go in silence."""
     ear = Ear(topics=('/talk',))
     for number in range(20):
@@ -175,7 +175,7 @@ def test_a_condition_triggers(tmp_path: Path) -> None:
     ('low: /x:nothing < 20', float64(1.0), 'has no number nothing'),
     ('low: /x:data < 20', b'\0\1\0\0\0', 'cannot be used in conditions'),
 ])  # fmt: skip
-def test_what_tells_nothing_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, cdr: bytes,
+def test_an_unusable_condition_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, cdr: bytes,
                                          said: str) -> None:  # fmt: skip
     """A field that is not there, a message that is none."""
     watched = Watched(tmp_path, text)
@@ -185,7 +185,7 @@ def test_what_tells_nothing_is_said_once(tmp_path: Path, caplog: pytest.LogCaptu
     assert [said in record.message for record in caplog.records] == [True]
 
 
-def test_what_an_agent_logs_triggers_as_it_is_wanted(tmp_path: Path) -> None:
+def test_agent_events_match_the_log_event_setting(tmp_path: Path) -> None:
     """Names that match, of the mission that is active; also what was logged just before it was over."""
     watched = Watched(tmp_path, log_event='^f')
     folder = MissionFolder(tmp_path / 'missions' / 'patrol_1')

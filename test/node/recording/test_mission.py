@@ -173,7 +173,7 @@ def test_batches_end_where_missions_begin_and_end(tmp_path: Path, opened: ExitSt
     assert setting.intake.asked == asked
 
 
-def test_what_the_robot_says_is_journaled(tmp_path: Path, opened: ExitStack) -> None:
+def test_robot_state_is_journaled(tmp_path: Path, opened: ExitStack) -> None:
     """From start to end, and the journal is let go of then; with ``join: false`` there is none."""
     setting, logger = watching(opened, tmp_path)
     logger.start_mission('patrol', '')
@@ -222,7 +222,7 @@ def test_a_field_is_read_once_a_period() -> None:
     assert found == [Reading(NOON_NS + number * SECOND // 10, 'battery_pct', float(number)) for number in (0, 10, 20)]
 
 
-def test_a_field_that_is_not_there_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_missing_field_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     """The mission goes on without it."""
     observer = new_observer(battery='talk:no.such', temperature='')
     messages = [STORE.types['std_msgs/msg/String']('hi')] * 20

@@ -42,7 +42,7 @@ def test_a_number_that_trembles_triggers_once() -> None:
     assert fired('x: t:f < 20', [19, 21] * 50, period_s=0.1) == [0]
 
 
-def test_what_is_no_number_tells_nothing() -> None:
+def test_nan_neither_triggers_nor_rearms() -> None:
     """Neither that the condition holds nor that it does not."""
     assert fired('x: t:f < 20 for 3', [19, float('nan'), 19, 19]) == [3]
 
@@ -62,7 +62,7 @@ def test_the_charge_of_a_battery_state_is_compared_as_the_message_has_it() -> No
     assert told == [(False, 73.0), (True, 25.0), (False, None)]
 
 
-def test_what_an_agent_logs_is_told_once(tmp_path: Path) -> None:
+def test_an_agent_event_triggers_once(tmp_path: Path) -> None:
     """Only what is new, with its age and data; other records, and what is half written, are not events."""
     journal = Journal(tmp_path / 'journal')
     tail = JournalTail(tmp_path / 'journal')

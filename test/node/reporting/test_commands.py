@@ -134,7 +134,7 @@ def test_a_flush_goes_along_the_data_flow(spooled: tuple[int, int], words: str) 
 
 
 @pytest.mark.parametrize('stuck', STAGES)
-def test_a_flush_that_does_not_finish_says_where(stuck: str) -> None:
+def test_an_incomplete_flush_names_its_stage(stuck: str) -> None:
     """It is not a success, the stage is named, and those after it are not waited for."""
     stages = Stages(stuck)
     success, words = ask(stages.commands(), 'flush')
@@ -253,7 +253,7 @@ def test_an_event_has_a_name_and_a_note() -> None:
     assert stages.asked == [('fall', 'command', 'on the stairs', ''), ('manual', 'service', '', '')]
 
 
-def test_what_it_tells() -> None:
+def test_read_only_commands() -> None:
     """Parameters, the mission that is active, the last status, and itself."""
     stages = Stages()
     commands = stages.commands()
@@ -278,7 +278,7 @@ def test_what_changes_something_is_logged(caplog: pytest.LogCaptureFixture) -> N
     ]
 
 
-def test_what_somebody_with_a_name_asked_for_is_kept() -> None:
+def test_named_requests_are_recorded() -> None:
     """With the node's answer, whatever it was; not what nobody's name is given with."""
     stages = Stages()
     commands = stages.commands()
@@ -293,7 +293,7 @@ def test_what_somebody_with_a_name_asked_for_is_kept() -> None:
     assert stages.acts[1][3] == 'nothing is recorded'
 
 
-def test_whom_somebody_asks_for_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_requester_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     """Also where a success is worth no line otherwise, and goes on to the event; whatever is in the name, it stays one line."""
     caplog.set_level(logging.INFO)
     stages = Stages()
@@ -319,7 +319,7 @@ def test_uploads_yield_for_some_seconds(caplog: pytest.LogCaptureFixture) -> Non
     assert ask(stages.commands(), 'yield')[0] is False
 
 
-def test_somebody_at_the_robot_asks_for_what_it_keeps() -> None:
+def test_pull_requests_kept_data() -> None:
     """The answer has the id of the request; what nobody can ask for is refused, and where nothing is kept all is."""
     stages = Stages()
     assert ask(stages.commands(), 'pull', want={'sensor': 'camera'}) == (

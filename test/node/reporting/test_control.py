@@ -168,7 +168,7 @@ def test_the_longest_line_is_taken(serve: Callable[..., Serving]) -> None:
     assert done['ok']
 
 
-def test_half_a_line_is_none(serve: Callable[..., Serving]) -> None:
+def test_an_incomplete_line_is_not_a_request(serve: Callable[..., Serving]) -> None:
     """Whoever hangs up in the middle of a request has asked for nothing."""
     serving = serve()
     with raw(serving) as client:
@@ -234,7 +234,7 @@ def test_an_answer_has_a_deadline(serve: Callable[..., Serving]) -> None:
     assert len(serving.asked) == 1
 
 
-def test_clients_are_told_when_it_closes(serve: Callable[..., Serving]) -> None:
+def test_clients_are_notified_on_close(serve: Callable[..., Serving]) -> None:
     """Those that wait for an answer, and those that do not; nobody waits for a node that is no more."""
     serving = serve()
     with serving.hold, raw(serving) as waits, raw(serving) as idles:

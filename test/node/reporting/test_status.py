@@ -173,7 +173,7 @@ def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
     assert setting.status.earlier.topics['/imu'].received == total - 50
 
 
-def test_what_lies_in_the_spool(setting: Setting) -> None:
+def test_the_state_of_the_spool(setting: Setting) -> None:
     """Objects and bytes that wait, for how long, and the room there is."""
     put(setting.spool, make('thor/a.jpg', b'12345'), make('thor/b.jpg', b'123', held='clock'))
     spool = setting.poll(3.0).spool
@@ -182,7 +182,7 @@ def test_what_lies_in_the_spool(setting: Setting) -> None:
     assert spool.max_bytes == 20 << 30
 
 
-def test_a_failing_worker_is_told(setting: Setting) -> None:
+def test_a_failing_worker_is_reported(setting: Setting) -> None:
     """Each thread has its row: whether it lives and fails, how often it failed and died, and why."""
     worker = setting.intake.worker
     worker.failing, worker.last_error, worker.failures, worker.deaths = True, 'ValueError: x', 3, 1
@@ -192,7 +192,7 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
     assert set(workers) == {'intake', *others}
 
 
-def test_a_stall_is_told(setting: Setting) -> None:
+def test_a_stall_is_reported(setting: Setting) -> None:
     """What the watchdog finds stands in the status: here a batch that nobody takes from the queue."""
     setting.queue.put(Batch('imu', '/imu', 't', (Sample(1, b''),), 1), 5)
     assert setting.poll().stalls == {}
@@ -216,7 +216,7 @@ def test_the_reader_finds_what_was_written(setting: Setting, tmp_path: Path) -> 
     assert [each.name for each in path.parent.glob('status-*')] == [path.name]
 
 
-def test_a_disk_that_refuses_is_said_once(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_write_error_is_logged_once(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
     """A status that cannot be written costs a line in the log, not the node."""
     blocked = file(setting.spool.root, 'thor').with_name('status-thor.json.part')
     blocked.mkdir()
@@ -227,7 +227,7 @@ def test_a_disk_that_refuses_is_said_once(setting: Setting, caplog: pytest.LogCa
     assert 'the status cannot be written' in record.message
 
 
-def test_a_spool_that_cannot_be_read_is_said_once(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unreadable_spool_is_logged_once(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
     """Then there is no status, and what was written before stays, growing old."""
     setting.spool.usage = broken  # type: ignore[method-assign]
     with caplog.at_level(logging.WARNING):

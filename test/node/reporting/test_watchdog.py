@@ -89,7 +89,7 @@ def test_a_slow_topic_is_given_its_time(watch: Watch) -> None:
     assert '/imu' in watch.wait(31)
 
 
-def test_a_connection_that_is_gone_is_another_cause(watch: Watch) -> None:
+def test_a_lost_connection_is_a_separate_cause(watch: Watch) -> None:
     """The publisher is in the graph, the subscription is matched with none."""
     watch.observe(times=20)
     watch.imu['matched'] = 0
@@ -132,7 +132,7 @@ def test_a_publisher_without_a_connection(watch: Watch, *, may_be_silent: bool) 
     assert 'ros2 topic info -v /imu' in watch.wait(11)['/imu']
 
 
-def test_a_topic_that_nobody_can_listen_to_here(watch: Watch) -> None:
+def test_a_topic_that_cannot_be_subscribed_to(watch: Watch) -> None:
     """Told at once, with the package that is missing."""
     watch.imu |= {'matched': 0, 'unavailable': 'its message package is not installed here (x)'}
     assert watch.poll() == {'/imu': 'it cannot be subscribed to here: its message package is not installed here (x)'}
