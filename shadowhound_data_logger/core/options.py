@@ -122,7 +122,10 @@ class SpoolSettings:
     )
     min_free_bytes: int = _setting(2 * GIBI, 'Free space to leave on the disk.', low=0)
     remember_days: float = _setting(
-        2.0, 'Days for which delivered objects are remembered, for ledger --verify and the live page.', low=1.0, high=3650.0
+        2.0,
+        'Days for which delivered objects are remembered, for ledger --verify and the live page: some 20 MB per hour of logging.',
+        low=1.0,
+        high=3650.0,
     )
 
 
