@@ -112,10 +112,10 @@ def _verdict(found: VerifiedBag) -> Iterator[RenderableType]:
     for check in found.findings:
         yield plain(f'{check.name} {check.finding}', 'red')
     yield from [REPAIR] if any(check.checked != 'presence' for check in found.findings) else []
-    sound = [check for check in found.checks if not check.finding]
-    how = ', '.join(sorted({check.checked for check in sound}))
-    are = 'is' if len(sound) == 1 else 'are'
-    text = f'{number(len(sound))} of {counted(len(found.checks), "file")} {are} sound (by {how})' if sound else 'No file is sound'
+    intact = [check for check in found.checks if not check.finding]
+    how = ', '.join(sorted({check.checked for check in intact}))
+    are = 'is' if len(intact) == 1 else 'are'
+    text = f'{number(len(intact))} of {counted(len(found.checks), "file")} {are} intact (by {how})' if intact else 'No file is intact'
     yield Text.assemble(plain(found.bag, 'bold'), ' ', plain(found.state, STATES.get(found.state, 'red')), f': {text}.')
     yield from lost_lines(found.missing)
     yield from remark_lines(found.remarks)

@@ -78,7 +78,7 @@ def test_verify_by_its_exit_code(home: Path) -> None:
     content[5000] ^= 1
     path.write_bytes(content)
     found = run(home, 'verify', '--deep', NAME)
-    assert (found.return_value, f'{NAME}_1.mcap' in found.output, '2 of 3 files are sound' in found.output) == (1, True, True)
+    assert (found.return_value, f'{NAME}_1.mcap' in found.output, '2 of 3 files are intact' in found.output) == (1, True, True)
     path.unlink()
     found = run(home, 'verify', NAME)
     assert (found.return_value, 'still growing' in found.output) == (1, True)
@@ -202,7 +202,7 @@ def test_a_bag_with_counters_as_times(tmp_path: Path) -> None:
     assert 'Hz' not in found
     assert '400 on 1 topic ' in found
     assert 'in 1 file ' in found
-    assert '1 of 1 file is sound' in run(home, 'verify', f'{folder}/').output
+    assert '1 of 1 file is intact' in run(home, 'verify', f'{folder}/').output
     there = home / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b'
     there.mkdir(parents=True)
     (there / 'b_0.mcap').write_bytes((folder / 'b_0.mcap').read_bytes())
