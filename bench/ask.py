@@ -2,8 +2,7 @@
 
 Run it as ``python bench/ask.py [--objects 1000000] [--missions 100000] [--folder F] [--json]``. The objects are batches of one
 second of an IMU; a few of them contain a bump, and only those are in the store, a folder: the others are never opened. The
-answers
-are compared with what was generated. Two of the queries are also run as commands, including the startup of Python.
+answers are compared with what was generated. Two of the queries are also run as commands, including the startup of Python.
 """
 
 from __future__ import annotations

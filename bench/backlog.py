@@ -4,11 +4,9 @@ Run it as ``python bench/backlog.py [--long] [--folder F] [--json]``; ``--long``
 minute.
 
 Claims: the real spool and schedule, no network. A claim is all steps until an object is chosen: from a cached list (``drain``),
-or
-with a query of the spool each time, as when new objects keep arriving (``poll``), also while a bucket with almost all objects
-rejects uploads (``blocked``). Shares: eight hours of the default profile wait, the profile continues, and a store accepts ten
-objects
-per second; the clock is simulated.
+or with a query of the spool each time, as when new objects keep arriving (``poll``), also while a bucket with almost all
+objects rejects uploads (``blocked``). Shares: eight hours of the default profile wait, the profile continues, and a store
+accepts ten objects per second; the clock is simulated.
 """
 
 from __future__ import annotations

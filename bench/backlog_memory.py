@@ -1,11 +1,9 @@
 """The node's memory while a backlog of bag slices and objects is uploaded, above its level before.
 
 One node records a bag in slices of ten seconds, keeps a full ring for events and makes forty objects per second, next to a
-simulated
-robot at its full rate. The S3 server is up (``--seconds``), down (``--away``), and up again (``--back``) for longer than a period
-of
-the catalog, which has a row for each delivered object. Memory is the resident memory of the node's process tree, sampled once per
-second; ``--table`` writes every sample, with glibc's and the queues' share.
+simulated robot at its full rate. The S3 server is up (``--seconds``), down (``--away``), and up again (``--back``) for longer
+than a period of the catalog, which has a row for each delivered object. Memory is the resident memory of the node's process
+tree, sampled once per second; ``--table`` writes every sample, with glibc's and the queues' share.
 """
 
 from __future__ import annotations

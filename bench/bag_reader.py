@@ -1,9 +1,8 @@
 """CPU microseconds for reading a message from a slice of a bag, next to the readers of `mcap`.
 
-Run it as ``python bench/bag_reader.py``. All read the same slices in turn, several times: the profile of a Go2, and 10,000 small
-messages per second, from the first message to the last, in file order, with checksums. ``mcap`` follows the index, ``mcap, record
-by
-record`` reads sequentially. Memory is the peak allocation.
+Run it as ``python bench/bag_reader.py``. All read the same slices in turn, several times: the profile of a Go2, and 10,000
+small messages per second, from the first message to the last, in file order, with checksums. ``mcap`` follows the index,
+``mcap, record by record`` reads sequentially. Memory is the peak allocation.
 """
 
 from __future__ import annotations

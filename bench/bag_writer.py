@@ -2,10 +2,8 @@
 
 Run it as ``python bench/bag_writer.py``. All write the same messages in turn, several times: the profile of a Go2 (30 images of
 150 KB and 230 small messages per second), and 10,000 small messages per second. Ours ends a chunk and syncs once per second of
-the
-recording, and computes the SHA-256 of the file; ``mcap, as ours`` does the same (its ``flush``, a file that hashes). The others
-do
-neither. `rosbags` skips CRC-32s as well. Memory is the peak allocation.
+the recording, and computes the SHA-256 of the file; ``mcap, as ours`` does the same (its ``flush``, a file that hashes). The
+others do neither. `rosbags` skips CRC-32s as well. Memory is the peak allocation.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """A plain logger as sketched by the integration guide (its Pattern 1), extended to all topics of a Go2.
 
-One callback per message; an S3 put inside the callback; keys by the current second. Differences from the sketch are noted. It is
-the
-baseline of ``node_cpu.py``, and also runs on its own: ``python bench/baseline_node.py``. On SIGINT it prints what it received and
-put.
+One callback per message; an S3 put inside the callback; keys by the current second. Differences from the sketch are noted. It
+is the baseline of ``node_cpu.py``, and also runs on its own: ``python bench/baseline_node.py``. On SIGINT it prints what it
+received and put.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
 """``MissionDataset`` through torch's DataLoader with two workers next to the integration guide's loop, from first byte to array.
 
-Run it as ``python bench/dataset.py [--frames 900] [--rounds 3] [--json]`` with torch installed (the extra ``train``). The guide's
-loop is its own: boto3's paginator, ``download_file`` one by one, then each file read and decoded (by Pillow). Both take turns on
-the
-same frames, 640 x 480, in the same SeaweedFS; a round's ratio is of two consecutive runs. Ours is measured three times: single
-JPEGs
-from the stream, the same by number (shuffled), and archives of a second. Creating the dataset (the catalog's query) and starting
-the
-workers is included; importing torch, boto3 and Daft is not.
+Run it as ``python bench/dataset.py [--frames 900] [--rounds 3] [--json]`` with torch installed (the extra ``train``). The
+guide's loop is its own: boto3's paginator, ``download_file`` one by one, then each file read and decoded (by Pillow). Both take
+turns on the same frames, 640 x 480, in the same SeaweedFS; a round's ratio is of two consecutive runs. Ours is measured three
+times: single JPEGs from the stream, the same by number (shuffled), and archives of a second. Creating the dataset (the
+catalog's query) and starting the workers is included; importing torch, boto3 and Daft is not.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """The cost of a ``MissionDataset`` of a million rows before its first sample: seconds and memory.
 
 Run it as ``python bench/dataset_index.py [--rows 1000000] [--rounds 3] [--json]``. The rows are frames of a second in hourly
-parts,
-in a folder as written by ``shadowhound-data fetch``. Each round is a separate process that has created a dataset of one part
-before,
-so that libraries are loaded and have planned once; the index is what one process passes to its workers.
+parts, in a folder as written by ``shadowhound-data fetch``. Each round is a separate process that has created a dataset of one
+part before, so that libraries are loaded and have planned once; the index is what one process passes to its workers.
 """
 
 from __future__ import annotations

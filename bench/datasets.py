@@ -2,10 +2,8 @@
 
 Run it as ``python bench/datasets.py [--frames 450] [--rounds 3] [--json]`` if lerobot has an environment (docs/development.md).
 Ours reads the objects of a mission, aligns them with odometry, records the source of each value and writes AV1; lerobot reads
-JPEGs
-of a folder, by default and with ``streaming_encoding``. Reading and decoding the JPEGs is included in all of them, importing
-modules
-in none. Memory is the peak of a process.
+JPEGs of a folder, by default and with ``streaming_encoding``. Reading and decoding the JPEGs is included in all of them,
+importing modules in none. Memory is the peak of a process.
 """
 
 from __future__ import annotations

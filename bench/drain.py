@@ -1,9 +1,8 @@
 """Prints how fast a backlog is uploaded, next to a bare boto3 thread pool that sends the same objects to the same server.
 
 Run it as ``python bench/drain.py [--threads N] [--rounds N] [--folder F] [--json]``; it starts a SeaweedFS, and F should be on
-the
-disk that the spool will be on. Both take turns, so that other load affects both: each ratio is of two consecutive runs, and their
-median counts. The CPU is this process's, without the server's.
+the disk that the spool will be on. Both take turns, so that other load affects both: each ratio is of two consecutive runs, and
+their median counts. The CPU is this process's, without the server's.
 """
 
 from __future__ import annotations

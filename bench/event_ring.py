@@ -2,8 +2,7 @@
 
 Two nodes one after the other, each next to a simulated robot, keep all its topics including raw images: one has a ring of four
 mebibytes, the other one of 64. The difference in resident memory is the ring's. Then an event writes the complete ring: the
-intake's
-rounds during that time are compared with those before, and the ledger shows whether anything was lost.
+intake's rounds during that time are compared with those before, and the ledger shows whether anything was lost.
 """
 
 from __future__ import annotations

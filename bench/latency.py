@@ -5,8 +5,7 @@ simulated Go2. Capture is the stamp in the message's header, set when it is publ
 confirmed when the put did (timed_node.py); the index's own times are listed as well.
 
 Once more while a backlog drains: the S3 server is down for ``--away`` seconds, during which the same is published, and messages
-of
-the first seconds after its return are measured until they are durable.
+of the first seconds after its return are measured until they are durable.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Stores what the node stores, and nothing else: it reads, keeps and encodes with the same code.
 
-One thread. The batches of one poll become files that are synced, one SQLite commit, and one put each, in sequence; then the files
-are
-deleted. There is no ledger, status, queue, lock, report, retry or recovery. ``node_least.py`` measures it next to the node. For
-each
-line on standard input it prints the CPU seconds of each of its steps.
+One thread. The batches of one poll become files that are synced, one SQLite commit, and one put each, in sequence; then the
+files are deleted. There is no ledger, status, queue, lock, report, retry or recovery. ``node_least.py`` measures it next to the
+node. For each line on standard input it prints the CPU seconds of each of its steps.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Similarity search over a day of images at 1 Hz: 86,400 vectors of 512 numbers, relative to one product of plain numpy.
 
 Run it as ``python bench/likeness.py [--vectors 86400] [--numbers 512] [--json]``. Only the search is measured, as the answer
-needs
-it: reading the parts and the catalog's rows is separate (``read_s``).
+needs it: reading the parts and the catalog's rows is separate (``read_s``).
 """
 
 from __future__ import annotations

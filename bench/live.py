@@ -4,17 +4,15 @@
     scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --round-trip 100 | --beside 0.5
     | --browser | --pairs 7 | --minutes 60 | --floor] [--kills 2]
 
-Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
-namespace whose uplink from the page has this many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
-WebRTC
-and decodes it. With ``--round-trip`` each packet is delayed by half of this many ms, as through a VPN, next to a viewer without
-delay; it needs root as well. ``--beside`` adds a second viewer that reads this many Mbit/s, and measures its effect on the first.
-``--browser`` opens the page in a Chromium on a simulated separate machine (a network namespace): delays of items until they
-arrive
-and are drawn, the first frame, outages of 10 s. ``--pairs`` alternates the node's CPU with and without viewers,
-``--minutes`` measures the page's memory while viewers come and go. ``--floor`` measures the page with one viewer next to
-processes that only read the same topics (live_floor.py), all at the same time. ``--kills`` kills it while eight watch; one of
-them never reads.
+Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a
+network namespace whose uplink from the page has this many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the
+camera as WebRTC and decodes it. With ``--round-trip`` each packet is delayed by half of this many ms, as through a VPN, next to
+a viewer without delay; it needs root as well. ``--beside`` adds a second viewer that reads this many Mbit/s, and measures its
+effect on the first. ``--browser`` opens the page in a Chromium on a simulated separate machine (a network namespace): delays of
+items until they arrive and are drawn, the first frame, outages of 10 s. ``--pairs`` alternates the node's CPU with and without
+viewers, ``--minutes`` measures the page's memory while viewers come and go. ``--floor`` measures the page with one viewer next
+to processes that only read the same topics (live_floor.py), all at the same time. ``--kills`` kills it while eight watch; one
+of them never reads.
 
 One line of JSON for each part, then the bars; the exit code is 1 if one is missed.
 """

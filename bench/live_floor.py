@@ -4,9 +4,8 @@
     scripts/with-env python bench/live_floor.py join|hear|take [TOPIC ...]
 
 ``join``: only the node; ``hear``: subscribed to the topics without taking messages; ``take``: takes all messages as the page
-does,
-and discards them. It reports that it is ready, and runs until it is stopped. ``bench/live.py --floor`` measures it next to the
-page.
+does, and discards them. It reports that it is ready, and runs until it is stopped. ``bench/live.py --floor`` measures it next
+to the page.
 """
 
 from __future__ import annotations

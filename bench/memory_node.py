@@ -1,8 +1,7 @@
 """The node, which also writes one line per second about its memory. For ``backlog_memory.py``.
 
-Its first argument is the file for the lines, one JSON object each, in bytes: what glibc has from the system and how much of it is
-in
-use (mallinfo2(3); nothing with another C library), and the content of the queues between its threads.
+Its first argument is the file for the lines, one JSON object each, in bytes: what glibc has from the system and how much of it
+is in use (mallinfo2(3); nothing with another C library), and the content of the queues between its threads.
 """
 
 from __future__ import annotations

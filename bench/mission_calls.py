@@ -1,8 +1,8 @@
 """Measures how long an agent waits for each call of MissionDataLogger, and for MLflow's own client.
 
-Tower is up, unreachable and hung in turn; ``start_mission`` is also measured 10 ms after the constructor, on the idle machine and
-next to ten busy processes, and compared with a bare request for a run. Run it as
-``python bench/mission_calls.py [--seconds S] [--folder F] [--json]``; S is for each of the three states.
+Tower is up, unreachable and hung in turn; ``start_mission`` is also measured 10 ms after the constructor, on the idle machine
+and next to ten busy processes, and compared with a bare request for a run. Run it as ``python bench/mission_calls.py [--seconds
+S] [--folder F] [--json]``; S is for each of the three states.
 """
 
 from __future__ import annotations

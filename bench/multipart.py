@@ -1,10 +1,9 @@
 """Prints how fast slices are uploaded in parts, next to boto3's ``upload_fileobj`` with the same files and server.
 
 Run it as ``python bench/multipart.py [--slices N] [--mebibytes M] [--rounds N] [--folder F] [--json]``; it starts a SeaweedFS.
-Both
-take turns, so that other load affects both: each ratio is of two consecutive runs, and their median counts. The CPU is this
-process's, without the server's. Ours sends the parts of one slice in sequence, verifies the complete file against its SHA-256 and
-could resume at any part; boto3's sends up to ten parts at a time and does neither.
+Both take turns, so that other load affects both: each ratio is of two consecutive runs, and their median counts. The CPU is
+this process's, without the server's. Ours sends the parts of one slice in sequence, verifies the complete file against its
+SHA-256 and could resume at any part; boto3's sends up to ten parts at a time and does neither.
 """
 
 from __future__ import annotations

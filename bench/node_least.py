@@ -1,10 +1,8 @@
 """The cost of the node above its floor, relative to a program that only encodes, writes, commits and puts (least_node.py).
 
 Both read the same simulated robot at the same time and put as many objects to the same S3 server. The floor is the node's
-middleware
-and its intake, as in ``node_cpu.py``. The other program's steps are the cost of storing an object with these encoders, one file
-and
-one put each, without accounting, reports, retries or recovery.
+middleware and its intake, as in ``node_cpu.py``. The other program's steps are the cost of storing an object with these
+encoders, one file and one put each, without accounting, reports, retries or recovery.
 """
 
 from __future__ import annotations

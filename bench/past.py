@@ -1,14 +1,10 @@
 """Measures how fast the live page shows the past of a spool of eight hours: the first moment, later ones, and playing.
 
 Run it as ``python bench/past.py [--objects 500000] [--delivered 0.5] [--program DIR ...] [--json]``. It creates the index of a
-spool
-whose objects are evenly spread over eight hours, the older part of them delivered, with files for the last minutes. Then it sends
-the
-requests of the page to the process that reads the past (``live/history.py``): days, the timeline, a moment, consecutive moments,
-jumps
-within those minutes, and a timeline of an hour. With ``--program`` it alternates between the packages in these folders, so that
-two
-versions can be compared on a busy machine.
+spool whose objects are evenly spread over eight hours, the older part of them delivered, with files for the last minutes. Then
+it sends the requests of the page to the process that reads the past (``live/history.py``): days, the timeline, a moment,
+consecutive moments, jumps within those minutes, and a timeline of an hour. With ``--program`` it alternates between the
+packages in these folders, so that two versions can be compared on a busy machine.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """CPU milliseconds and memory of a put in this process, next to obstore and boto3.
 
 Run it as ``python bench/puts.py``. Each client puts the same small objects into one SeaweedFS, from as many threads, in turn,
-several
-times: from a file, with metadata, without overwriting. Ours reads the file and checks it against its SHA-256, and the server
-verifies
-a CRC-32. obstore hashes what it sends; of checksums that a server verifies it has SHA-256 and CRC-64. The memory is the increase
-of a
-process after its first round, imports included.
+several times: from a file, with metadata, without overwriting. Ours reads the file and checks it against its SHA-256, and the
+server verifies a CRC-32. obstore hashes what it sends; of checksums that a server verifies it has SHA-256 and CRC-64. The
+memory is the increase of a process after its first round, imports included.
 """
 
 from __future__ import annotations

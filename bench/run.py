@@ -1,8 +1,7 @@
 """``make bench``: all benchmarks one after the other, then docs/evidence/benchmarks.md with their results.
 
 About half an hour; ``--quick`` takes about three minutes and does not change docs/. Exit code 1 if a bar is missed, or a
-benchmark
-fails (docs/ is then unchanged, too). Nothing else should run on the machine during that time.
+benchmark fails (docs/ is then unchanged, too). Nothing else should run on the machine during that time.
 """
 
 from __future__ import annotations

@@ -68,9 +68,8 @@ def flow(profile: Profile) -> Iterator[tuple[str, ...]]:
 def catalog(profile: Profile) -> Iterator[tuple[str, ...]]:
     """Rows: the rows of a day, and the requests of a query over all robots' day: of row files, and of the tables.
 
-    Row files: a LIST per 1,000 of a robot, and a GET per file. Tables whose row files have expired: two LISTs for each robot (are
-    there
-    newer row files of objects, of deletions?) and one GET for its file of that day.
+    Row files: a LIST per 1,000 of a robot, and a GET per file. Tables whose row files have expired: two LISTs for each robot
+    (are there newer row files of objects, of deletions?) and one GET for its file of that day.
     """
     for robots in FLEETS:
         parts = robots * DAY_S // PART_S

@@ -1,8 +1,7 @@
 """``lake sink`` of a million rows to a server that accepts everything immediately: the duration of our half, and its memory.
 
 Run it as ``python bench/sink.py [--days 30] [--folder F] [--json]``: 30 days are 720 parts of an hour in a folder store, a
-million
-rows, as in ``bench/lake.py``. The memory is that of the sending process, sampled a few times per second.
+million rows, as in ``bench/lake.py``. The memory is that of the sending process, sampled a few times per second.
 """
 
 from __future__ import annotations

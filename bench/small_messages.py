@@ -1,8 +1,7 @@
 """How many small messages per second the node stores without loss: sensor_msgs/Imu into JSON batches of a second, to S3.
 
-From a publisher of serialized messages in another process; the S3 server runs on the same machine. Each rate has a separate node
-and
-ledger. The ledger decides: all published, all received, all stored, nothing missed or dropped.
+From a publisher of serialized messages in another process; the S3 server runs on the same machine. Each rate has a separate
+node and ledger. The ledger decides: all published, all received, all stored, nothing missed or dropped.
 """
 
 from __future__ import annotations

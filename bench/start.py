@@ -2,10 +2,8 @@
 subscription.
 
 Messages published before that are lost with each restart. A simulated Go2 publishes; the node starts, stops and restarts on the
-same
-spool, with an S3 server that answers. ``first`` is when the first message of ``/odom`` in the spool arrived, ``durable`` the
-commit
-with the first object, ``stop`` the time from SIGINT to the exit of the process.
+same spool, with an S3 server that answers. ``first`` is when the first message of ``/odom`` in the spool arrived, ``durable``
+the commit with the first object, ``stop`` the time from SIGINT to the exit of the process.
 """
 
 from __future__ import annotations

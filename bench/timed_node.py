@@ -1,11 +1,9 @@
 """The node, which also records when each object became durable and when the store confirmed it.
 
-It is ``sensor_logger_node`` with two of its calls timed: ``Spool.commit`` (its result is durable) and ``S3Store.put`` (confirmed
-on
-return). When it exits it prints ``{"durable": {id: ns}, "confirmed": {id: ns}}``, wall clock. For ``latency.py``: the index's own
-times are less precise. ``created_ns`` is taken when a commit starts, before its syncs, and ``settled_ns`` when the commit starts
-that
-records the outcome of a delivery, up to a commit period after the store's answer.
+It is ``sensor_logger_node`` with two of its calls timed: ``Spool.commit`` (its result is durable) and ``S3Store.put``
+(confirmed on return). When it exits it prints ``{"durable": {id: ns}, "confirmed": {id: ns}}``, wall clock. For ``latency.py``:
+the index's own times are less precise. ``created_ns`` is taken when a commit starts, before its syncs, and ``settled_ns`` when
+the commit starts that records the outcome of a delivery, up to a commit period after the store's answer.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Prints how long a commit blocks other processes from the index: from BEGIN to the end of COMMIT.
 
-Run it as ``python bench/transactions.py [--folder F] [--json]``; F should be on the disk that the spool will be on. It commits as
-many
-objects of the same size as the default profile, as with every message stored, and as the largest possible commit of the writer.
-After
-each commit it syncs a file with as many bytes as the transaction added to the index's log: that is the disk's share. Finally a
-client
-requests very many kept objects, and cancels the request.
+Run it as ``python bench/transactions.py [--folder F] [--json]``; F should be on the disk that the spool will be on. It commits
+as many objects of the same size as the default profile, as with every message stored, and as the largest possible commit of the
+writer. After each commit it syncs a file with as many bytes as the transaction added to the index's log: that is the disk's
+share. Finally a client requests very many kept objects, and cancels the request.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """CPU and memory of a node that listens to Cyclone DDS through Fast DDS, relative to one on Fast DDS, and to the robot's own RMW.
 
 Each node has a separate domain and publisher, all run at the same time, and rounds take turns: one publisher sends, and the CPU
-of its
-node is counted. The nodes keep almost nothing. A node in rmw_cyclonedds_cpp is included if that is installed.
+of its node is counted. The nodes keep almost nothing. A node in rmw_cyclonedds_cpp is included if that is installed.
 """
 
 from __future__ import annotations

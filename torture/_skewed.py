@@ -1,8 +1,7 @@
 """Publishers whose stamps and arrivals differ in a known way, and the witness file of what they published.
 
-``python -m torture._skewed WITNESS SECONDS`` waits until each topic has a subscriber, publishes for this long and exits. It does
-not
-import the package under test.
+``python -m torture._skewed WITNESS SECONDS`` waits until each topic has a subscriber, publishes for this long and exits. It
+does not import the package under test.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Hostile messages through every encoder, damaged spools and indexes through recovery: no crash, no hang, no damage passes as
 good.
 
-With ``--readers``, all readers of robots' data instead (torture/_readers.py): only our own errors, nothing written elsewhere, at
-most
-two gigabytes of memory.
+With ``--readers``, all readers of robots' data instead (torture/_readers.py): only our own errors, nothing written elsewhere,
+at most two gigabytes of memory.
 
 Each round is reproducible from its seed: ``--seed`` is that of the first one.
 """

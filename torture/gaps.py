@@ -1,18 +1,13 @@
 """Loses messages on purpose and compares the gap journal with what was sent: when, how many, and why.
 
-A publisher numbers and stamps its messages on four topics, RELIABLE and BEST_EFFORT, small and large, and the node stores all of
-them.
-The node is stopped for seconds, starved, paused, and killed and restarted; files of its objects are damaged before upload, so
-that
-they are quarantined, and some are repaired and retried. A second node has no store and space for few objects, which it evicts,
-and its
-disk is filled up. Messages that are not in the store, between two messages that are, are a gap: the journal must have it from the
-one
-message to the other, within a period and after a kill within the open batch, with its count and its cause, and nothing else. Rows
-with the times of the lost messages themselves may be further off while the publisher was stalled, which its other topics show.
-The
-timeline of the live page, read in a Chromium, must show the same. During all this another process reads the ledger, which must
-balance at every commit.
+A publisher numbers and stamps its messages on four topics, RELIABLE and BEST_EFFORT, small and large, and the node stores all
+of them. The node is stopped for seconds, starved, paused, and killed and restarted; files of its objects are damaged before
+upload, so that they are quarantined, and some are repaired and retried. A second node has no store and space for few objects,
+which it evicts, and its disk is filled up. Messages that are not in the store, between two messages that are, are a gap: the
+journal must have it from the one message to the other, within a period and after a kill within the open batch, with its count
+and its cause, and nothing else. Rows with the times of the lost messages themselves may be further off while the publisher was
+stalled, which its other topics show. The timeline of the live page, read in a Chromium, must show the same. During all this
+another process reads the ledger, which must balance at every commit.
 """
 
 from __future__ import annotations

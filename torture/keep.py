@@ -1,15 +1,11 @@
 """Kills robot, requester and Tower while many requests for kept data are open, and the disk is short of space or full.
 
 A node keeps images, clouds, batches and slices, more than keep.max_bytes allows, on a small disk that another process fills at
-times.
-Requesters request random seconds of it, some with a short expiry, some cancel, a hundred at the same time; any process may be
-killed.
-What happens next depends on the answers, never on the time: a slow machine makes the campaign longer, not easier. Afterwards
-every
-request has its last answer, every object seen at the time of the request is in the store, verified, or accounted for, of slices
-the
-messages of the requested time, and the ledger balances. A campaign that served few requests, or in which some kind of fault never
-happened while requests were open, has failed.
+times. Requesters request random seconds of it, some with a short expiry, some cancel, a hundred at the same time; any process
+may be killed. What happens next depends on the answers, never on the time: a slow machine makes the campaign longer, not
+easier. Afterwards every request has its last answer, every object seen at the time of the request is in the store, verified, or
+accounted for, of slices the messages of the requested time, and the ledger balances. A campaign that served few requests, or in
+which some kind of fault never happened while requests were open, has failed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Kills the node repeatedly with SIGKILL at random points under full load, with the store up and down.
 
-The simulated Go2 publishes at its full rates, everything is stored, a witness records what was published. Afterwards every object
-of
-the store is compared with it, and missing messages must belong to a kill and be within the promised limit.
+The simulated Go2 publishes at its full rates, everything is stored, a witness records what was published. Afterwards every
+object of the store is compared with it, and missing messages must belong to a kill and be within the promised limit.
 """
 
 from __future__ import annotations

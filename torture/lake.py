@@ -1,11 +1,9 @@
 """Ingests, compacts and queries a lake while robots deliver rows and processes are killed: every row must be there exactly once.
 
-An embedded Tower with a bucket ``lake``; a writer delivers row files of several robots, some rows twice. Two ingesters add them,
-merge files and expire row files; each is killed (SIGKILL) at random moments and restarted, and the S3 server is stopped and
-started.
-A reader queries all the time: every row delivered before its query started must be in the answer, and no row twice. At the end
-the
-tables alone must have everything delivered.
+An embedded Tower with a bucket ``lake``; a writer delivers row files of several robots, some rows twice. Two ingesters add
+them, merge files and expire row files; each is killed (SIGKILL) at random moments and restarted, and the S3 server is stopped
+and started. A reader queries all the time: every row delivered before its query started must be in the answer, and no row
+twice. At the end the tables alone must have everything delivered.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
 """Loses messages on purpose and compares the ledger with what was sent, message by message, on Fast DDS and on Cyclone DDS.
 
 Publishers of both, one and several per topic, RELIABLE and BEST_EFFORT, small and large, number their messages. The node is
-stopped
-for seconds, starved, and killed and restarted, and a publisher is killed and replaced, once while the node is not running. Every
-message that the node keeps is stored, so a gap in the numbers of the store is what was missed, or what a kill took from open
-batches
-(``dropped: restart``). If the ledger is ``exact``, all its counts must be those of the numbers. A second node gets no numbers: it
-must
-not claim that nothing was lost, and its estimates must be close.
+stopped for seconds, starved, and killed and restarted, and a publisher is killed and replaced, once while the node is not
+running. Every message that the node keeps is stored, so a gap in the numbers of the store is what was missed, or what a kill
+took from open batches (``dropped: restart``). If the ledger is ``exact``, all its counts must be those of the numbers. A second
+node gets no numbers: it must not claim that nothing was lost, and its estimates must be close.
 
 Messages that a publisher sends at its very end, after which none arrives, are in no gap and in no ledger: they are reported here.
 """

@@ -1,11 +1,9 @@
 """Deletes, cuts and overwrites the spool's index under a node, ``bag record`` and a mission agent, while all three are at work.
 
 Afterwards any of them is killed or stopped, and restarted as by a supervisor; so is one that exits on its own. A publisher
-numbers its
-messages. At the end each message must be in the store once for each of the three that took it; a missing one must belong to the
-exit
-of a process, or be listed with its reason. No object may be overwritten, no bag may lack a manifest or claim more than it has, no
-watermark may cover an unlisted loss, and each mission must be one run with each of its points and frames.
+numbers its messages. At the end each message must be in the store once for each of the three that took it; a missing one must
+belong to the exit of a process, or be listed with its reason. No object may be overwritten, no bag may lack a manifest or claim
+more than it has, no watermark may cover an unlisted loss, and each mission must be one run with each of its points and frames.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Kills a robot that follows a registry, with ``kill -9``, at each step of a sync, an activation, a rollback and a report.
 
 MLflow's registry and SeaweedFS are real, with the permissions of a robot; so are signatures, hashes and smoke runs. A step is a
-call
-that makes something durable, or a downloaded piece; many kills happen at random times instead. Some rounds fill the disk at a
-step.
-After each, ``current`` must be a complete, verified version: the one that was active before, or the new one. The interrupted
-action is
-then repeated, and must succeed.
+call that makes something durable, or a downloaded piece; many kills happen at random times instead. Some rounds fill the disk
+at a step. After each, ``current`` must be a complete, verified version: the one that was active before, or the new one. The
+interrupted action is then repeated, and must succeed.
 """
 
 from __future__ import annotations

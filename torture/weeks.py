@@ -1,11 +1,9 @@
 """Simulated weeks of a robot that keeps its recordings: shifts, a dock, two WiFi networks, a disk that others fill, requests.
 
 Time is virtual; spool, rules, thinning, requests, catalog and the store, a folder, are real. Each minute of a shift the robot
-records
-an archive of images, every ten minutes a slice of a bag, now and then an event. Every hour the ledger is compared with the gap
-journal, at the end of a day with the files, the catalog and the store: nothing is thinned, evicted, sent or deleted unless a rule
-says
-so, and of the last day at least one image per second is left. At the end ``lake prune`` keeps half.
+records an archive of images, every ten minutes a slice of a bag, now and then an event. Every hour the ledger is compared with
+the gap journal, at the end of a day with the files, the catalog and the store: nothing is thinned, evicted, sent or deleted
+unless a rule says so, and of the last day at least one image per second is left. At the end ``lake prune`` keeps half.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 
 It needs only boto3, takes AWS_ENDPOINT_URL and the keys of the user ``tower`` from the environment, and can be run again at any
 time. Replacing: SeaweedFS has no policy condition for a PUT without If-None-Match, so versions are kept: the first one stays
-below
-a second one, and a robot can delete neither. Features that the server rejects are reported, and are not a failure.
+below a second one, and a robot can delete neither. Features that the server rejects are reported, and are not a failure.
 """
 
 from __future__ import annotations
@@ -39,11 +38,9 @@ GIB = 1 << 30
 def policy(bucket: str, robots: Sequence[str], full: Sequence[str] = ()) -> str:
     """Denies to robots and Spark what their actions would allow: SeaweedFS's ``Write`` includes deleting.
 
-    A URL signed with a robot's keys would let other clients use its permissions later, without the keys: in the old form (version
-    2)
-    for years. An object that a robot encrypted with its own key (SSE-C) would be unreadable for all others. ``full`` are robots
-    that
-    have reached their quota.
+    A URL signed with a robot's keys would let other clients use its permissions later, without the keys: in the old form
+    (version 2) for years. An object that a robot encrypted with its own key (SSE-C) would be unreadable for all others.
+    ``full`` are robots that have reached their quota.
     """
 
     def deny(sid: str, users: Sequence[str], actions: Sequence[str], **condition: dict[str, str]) -> dict[str, Any]:

@@ -1,10 +1,8 @@
 """Runs a Tower without Docker, in the foreground: SeaweedFS, PostgreSQL if installed (otherwise SQLite) and MLflow.
 
 The same setup as compose.yaml, as plain processes of this user, with the credentials of make_secrets.py and all data in one
-folder.
-It returns when it is interrupted, and leaves no process behind, however it ends. As root it runs PostgreSQL and MLflow as
-separate
-users, whose files are below /var/lib; it creates the one of MLflow (``shadowhound-mlflow``).
+folder. It returns when it is interrupted, and leaves no process behind, however it ends. As root it runs PostgreSQL and MLflow
+as separate users, whose files are below /var/lib; it creates the one of MLflow (``shadowhound-mlflow``).
 """
 
 from __future__ import annotations

@@ -115,7 +115,11 @@ def _verdict(found: VerifiedBag) -> Iterator[RenderableType]:
     intact = [check for check in found.checks if not check.finding]
     how = ', '.join(sorted({check.checked for check in intact}))
     are = 'is' if len(intact) == 1 else 'are'
-    text = f'{number(len(intact))} of {counted(len(found.checks), "file")} {are} intact (by {how})' if intact else 'No file is intact'
+    text = (
+        f'{number(len(intact))} of {counted(len(found.checks), "file")} {are} intact (by {how})'
+        if intact
+        else 'No file is intact'
+    )
     yield Text.assemble(plain(found.bag, 'bold'), ' ', plain(found.state, STATES.get(found.state, 'red')), f': {text}.')
     yield from lost_lines(found.missing)
     yield from remark_lines(found.remarks)

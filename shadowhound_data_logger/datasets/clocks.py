@@ -1,8 +1,7 @@
 """The offset of another machine's clock from the robot's, and its uncertainty, from events that both machines timed.
 
 Such an event is a pair of times: ``sensor_msgs/TimeReference`` (``header.stamp`` by the robot's clock, ``time_ref`` by the
-other),
-or a line of a file. Between pairs the other clock has a constant drift of at most ``MAX_DRIFT``.
+other), or a line of a file. Between pairs the other clock has a constant drift of at most ``MAX_DRIFT``.
 """
 
 from __future__ import annotations
@@ -63,9 +62,8 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
     """The offset in an episode; ``pairs`` is (n, 2), the robot's and the other's time of each event. Raises LakeError if unknown.
 
     The uncertainty is the distance of 95 % of the pairs from the line through them, plus ``MAX_DRIFT`` times the time from the
-    nearest
-    pair to the end of the episode; with too few or too close pairs for a line, from all of them. A delay that is equal in both
-    directions of a network is included; a delay in one direction cannot be seen in pairs.
+    nearest pair to the end of the episode; with too few or too close pairs for a line, from all of them. A delay that is equal
+    in both directions of a network is included; a delay in one direction cannot be seen in pairs.
     """
     robot = pairs[:, 0]
     near = pairs[(robot >= begin_ns - NEAR_NS) & (robot <= end_ns + NEAR_NS)]

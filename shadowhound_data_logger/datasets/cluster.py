@@ -96,9 +96,8 @@ class Cluster:
     def built(self, jobs: Sequence[EpisodeJob], workers: int | None, say: Callable[[str], None]) -> list[dict[str, Any]]:
         """The ``episode.json`` of each job, in order; the files are in the folders of the jobs.
 
-        ``workers`` episodes are built at a time, by default one per core of the cluster. A mission whose worker dies is given to
-        another
-        one. Raises LakeError if that fails too or there is no such cluster, StoreError, OSError.
+        ``workers`` episodes are built at a time, by default one per core of the cluster. A mission whose worker dies is given
+        to another one. Raises LakeError if that fails too or there is no such cluster, StoreError, OSError.
         """
         todo = [job for job in jobs if not (job[-1] / EPISODE_JSON).is_file()]
         if todo:

@@ -86,8 +86,7 @@ def export(  # noqa: PLR0913 - the flags of the command
     """Add the selected missions to the dataset in this folder, which is created if missing.
 
     Episodes are built here, one at a time or ``workers`` at a time, or on a cluster, by default one per core. With ``wait`` it
-    returns
-    once the gaps of each mission are known, or after an hour without news. Raises LakeError, SettingError, StoreError.
+    returns once the gaps of each mission are known, or after an hour without news. Raises LakeError, SettingError, StoreError.
     """
     findings = Findings() if findings is None else findings
     with writing(folder, is_dry=is_dry):

@@ -105,8 +105,7 @@ def identity_of(stamps_ns: NDArray[np.int64], names: Sequence[str], positions: N
     """SHA-256 in hex of an episode as recorded: joints, unit, the time of each sample since the first, all numbers.
 
     The numbers are hashed as float64, little endian, row by row, before units are converted. So it does not depend on the file,
-    on the
-    episode's number, or on the width of a column with the same values.
+    on the episode's number, or on the width of a column with the same values.
     """
     header = {'names': list(names), 'unit': unit, 'samples': len(positions), 'has_commands': commands is not None}
     whole = hashlib.sha256(json.dumps(header, sort_keys=True).encode())

@@ -358,8 +358,7 @@ class Recordings:
         """The slices with messages of a topic, and the times each is read for: two bags of one time contain each message twice.
 
         A later bag adds what the earlier ones lack: all of that if the bag is of the same mission as the first one, otherwise
-        only if it is
-        more than a second of the time that counts.
+        only if it is more than a second of the time that counts.
         """
         found: list[_SlicePart] = []
         for bag in self._bags:
@@ -458,8 +457,7 @@ def select_bags(manifests: Iterable[Manifest], mission_id: str, run_id: str, cou
     """The bags with messages of a mission's time, the preferred ones first.
 
     Order: the mission's own bags, those of no mission, those of other missions, those of events if they have nearly all of it;
-    within
-    each, the one with most of the mission first.
+    within each, the one with most of the mission first.
     """
     found = []
     for manifest in manifests:

@@ -75,11 +75,9 @@ def interpolated(stamps: NDArray[np.int64], values: NDArray[np.float64], ticks: 
                  turns: Sequence[slice] = ()) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
     """(values, the earlier of the two messages): linear between the last two messages, evaluated one period before the tick.
 
-    Both have arrived by then: it is as causal as holding, and one period late. ``turns`` are quaternions among the columns (x y z
-    w),
-    which are interpolated by slerp. If two messages are more than ``max_gap_ns`` apart, or there are no two, the newest one is
-    held
-    (-1).
+    Both have arrived by then: it is as causal as holding, and one period late. ``turns`` are quaternions among the columns (x y
+    z w), which are interpolated by slerp. If two messages are more than ``max_gap_ns`` apart, or there are no two, the newest
+    one is held (-1).
     """
     newest = latest(stamps, ticks)
     found, earlier = values[newest].copy(), np.full(len(ticks), -1, np.int64)

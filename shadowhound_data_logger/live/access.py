@@ -122,14 +122,11 @@ class _SignOuts:
     """Sign-outs of a role, in a file that survives restarts as the cookies do.
 
     Its lines: the SHA-256 of the rest, a time ``until``, and for each sign-in the expiry of its cookie and its nonce. Sign-ins
-    that
-    expire no later than ``until`` count as signed out. So an entry can be dropped, once it has expired or when there are too
-    many,
-    without becoming valid again, even if the clock is set back.
+    that expire no later than ``until`` count as signed out. So an entry can be dropped, once it has expired or when there are
+    too many, without becoming valid again, even if the clock is set back.
 
     A damaged file could have contained any sign-in: all earlier sign-ins then count as signed out, which is logged, and users
-    sign in
-    again. A missing file contains none: the first sign-out creates it.
+    sign in again. A missing file contains none: the first sign-out creates it.
 
     ``keep`` waits for the disk and can be called from any thread, everything else from the event loop; ``_lock`` guards changes.
     Several pages that share the tokens share the file too.

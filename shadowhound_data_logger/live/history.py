@@ -200,8 +200,7 @@ class PastReader:
         """What was recorded between two times, the gaps, and events; ``by`` is which of the two times of messages counts.
 
         Missions, bags, events and labels have the robot's own time, which is that of arrival. ``is_fitted``: only the part in
-        which
-        something was recorded. ``recorded``: [topic, from, to]; ``kept``: the same for objects only on the robot;
+        which something was recorded. ``recorded``: [topic, from, to]; ``kept``: the same for objects only on the robot;
         ``marks``: [kind, name, from, to, text]; ``deliveries``: [from, to, delivered or null] of late deliveries; ``battery``:
         [at, percent]; times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
         """
@@ -326,9 +325,8 @@ class PastReader:
     def recent(self, robot: str, now_ns: int) -> tuple[dict[str, Any], bytes]:
         """The initial plots, path and plan of the live view, as items like those of a moment.
 
-        Series of the last seconds; earlier ones only from the spool, and a few clouds. ``at`` is by the clock of this machine, as
-        in live
-        items. Raises DataLoggerError.
+        Series of the last seconds; earlier ones only from the spool, and a few clouds. ``at`` is by the clock of this machine,
+        as in live items. Raises DataLoggerError.
         """
         walked = self._source.between(robot, now_ns - PATH_NS, now_ns + 1, BY_RECEIVED)
         by_topic: dict[str, list[PastObject]] = {}

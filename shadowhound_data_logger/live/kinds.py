@@ -1,8 +1,7 @@
 """What the page shows of a message: its type decides the kind, and the kind what is sent to the browser.
 
 A camera's frame is sent as JPEG, a cloud as uint16 in its bounding box, everything else as rows of float32. Frames and clouds
-exist
-in three sizes (``FULL`` to ``SMALLEST``), for slower links. Raises Rejected for an invalid message.
+exist in three sizes (``FULL`` to ``SMALLEST``), for slower links. Raises Rejected for an invalid message.
 """
 
 from __future__ import annotations
@@ -45,8 +44,7 @@ _COLORSPACES: Final = {
 }  # fmt: skip
 _MEASURED: Final = {'16UC1': ('u2', 'm'), '32FC1': ('f4', 'm'), 'mono16': ('u2', '')}
 """Images of distances (REP 118: millimeters as uint16, meters as float32) and of other values, shown in colors: numpy's name of
-the
-value type, and the unit.
+the value type, and the unit.
 """
 _RAMP: Final = ((250, 235, 110), (245, 150, 60), (220, 70, 90), (130, 40, 130), (50, 30, 110), (20, 25, 70))
 """Red, green and blue from near to far; ``page/style.css`` has the same for the legend."""

@@ -2,10 +2,8 @@
 (``rtsp_process.py``).
 
 RFC 2435 supports baseline JPEGs in YUV 4:2:0 or 4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent,
-which
-is logged. A topic is read while it is played. Debian and Ubuntu build GStreamer's bindings for the system's Python, so a process
-of
-that Python runs the script.
+which is logged. A topic is read while it is played. Debian and Ubuntu build GStreamer's bindings for the system's Python, so a
+process of that Python runs the script.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
 """Serves JPEGs from standard input over RTSP: a script for the system's Python, which has GStreamer's bindings (python3-gi).
 
 It imports nothing from this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON
-and
-of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``. Later ones have the served ``topics``,
-or
-a ``topic`` with ``width`` and ``height`` of the JPEG in the body. It prints lines of JSON: ``port``, ``watched`` (topics that
-clients play), ``players`` (the addresses of these clients), or ``error``. It exits at the end of its input.
+and of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``. Later ones have the served
+``topics``, or a ``topic`` with ``width`` and ``height`` of the JPEG in the body. It prints lines of JSON: ``port``, ``watched``
+(topics that clients play), ``players`` (the addresses of these clients), or ``error``. It exits at the end of its input.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """What is sent to one browser, in which order, and never more than its link can carry.
 
-A frame of the WebSocket is a byte with its lane, a byte of flags (1: an item starts, 2: it ends), two unused bytes, and a part of
-an
-item (``kinds.LiveItem.packed``); on lane 0 it is several complete items, each after a uint32 with its length. Each browser
-reports
-how many bytes of frames it has received, as a uint32 that wraps: after 2 KB or more, once for everything that arrived together.
-At
-most a window of bytes is in flight; what waits is small, or the newest of its topic.
+A frame of the WebSocket is a byte with its lane, a byte of flags (1: an item starts, 2: it ends), two unused bytes, and a part
+of an item (``kinds.LiveItem.packed``); on lane 0 it is several complete items, each after a uint32 with its length. Each
+browser reports how many bytes of frames it has received, as a uint32 that wraps: after 2 KB or more, once for everything that
+arrived together. At most a window of bytes is in flight; what waits is small, or the newest of its topic.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
 """The camera as video over WebRTC, encoded once for all viewers. Importing this loads aiortc (the extra ``webrtc``).
 
 The newest JPEG of a topic is decoded and encoded as VP8 on a separate thread; its packets are sent to each peer. RTP timestamps
-are
-the times of arrival, at 90 kHz, so the page knows the age of each frame. Packets are sent only to the viewer's own address:
+are the times of arrival, at 90 kHz, so the page knows the age of each frame. Packets are sent only to the viewer's own address:
 candidates of an offer contribute ports and no addresses, and no STUN server is used. aiortc has no interface for three things
-that
-are needed: the receiver's bandwidth estimate, its requests for key frames, and the start of timestamps. They are read from
-private
-attributes of the versions pinned in setup.py.
+that are needed: the receiver's bandwidth estimate, its requests for key frames, and the start of timestamps. They are read from
+private attributes of the versions pinned in setup.py.
 """
 
 from __future__ import annotations

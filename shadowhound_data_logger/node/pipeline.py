@@ -244,8 +244,7 @@ class Pipeline:
         """Called several times per second: restarts threads that ended, and reports the status once per second.
 
         A failure of a thread is reported immediately. At the start of each UTC day the ledger is uploaded. Raises SpoolError if
-        the
-        spool cannot be repaired while in use.
+        the spool cannot be repaired while in use.
         """
         if self.writer.damaged:
             text = f'the index of the spool {self.spool.root} is damaged'

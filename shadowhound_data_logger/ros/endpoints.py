@@ -124,11 +124,9 @@ def plans(topic: str, type_name: str, publishers: Sequence[Endpoint], depth: int
     """The subscriptions that miss nothing from these publishers, all of this type.
 
     A RELIABLE subscription receives nothing from a BEST_EFFORT publisher, and a BEST_EFFORT one may lose what a RELIABLE
-    publisher
-    would resend; one that requests the history of a TRANSIENT_LOCAL publisher receives nothing from the others. So there is one
-    for each kind of publisher present. While there is none, two match any publisher from its first message on. A message that
-    both
-    receive is a repeat, and is dropped.
+    publisher would resend; one that requests the history of a TRANSIENT_LOCAL publisher receives nothing from the others. So
+    there is one for each kind of publisher present. While there is none, two match any publisher from its first message on. A
+    message that both receive is a repeat, and is dropped.
     """
     offered = {(publisher.reliable, publisher.reliable and publisher.transient_local) for publisher in publishers}
     kinds = ((True, True), (True, False), (False, False))

@@ -63,9 +63,8 @@ _VERIFIED: Final[dict[str, bool]] = {}
 class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
     """Keeps its entities out of every wait set.
 
-    That includes event handlers: in rmw_fastrtps a reader's events and its data share one condition, so a wait set with an event
-    of
-    an undrained subscription returns immediately, forever (a full core, measured on Kilted).
+    That includes event handlers: in rmw_fastrtps a reader's events and its data share one condition, so a wait set with an
+    event of an undrained subscription returns immediately, forever (a full core, measured on Kilted).
     """
 
     def add_entity(self, entity: Any) -> None:
@@ -107,9 +106,8 @@ class SubscriptionRefused(RuntimeError):
 def message_class(type_name: str) -> type:
     """The rclpy class of ``package/msg/Name``, ``package/srv/Name_Event`` or ``package/action/Name_FeedbackMessage``.
 
-    Raises TypeUnavailable. The name may come from any machine in the network: a package is imported only if it has interfaces of
-    this
-    kind, because an import executes its code.
+    Raises TypeUnavailable. The name may come from any machine in the network: a package is imported only if it has interfaces
+    of this kind, because an import executes its code.
     """
     match = _TYPE.fullmatch(type_name)
     if match is None:

@@ -1,14 +1,13 @@
 """Shared memory that killed processes leave in /dev/shm: Fast DDS keeps 35 MB (with our profile) for each of them.
 
 The owner of a segment ``fastdds_X`` (Fast DDS 3) or ``fastrtps_X`` (Fast DDS 2), where X is 16 random hex digits, holds a flock
-on the file ``..._X_el`` in the same folder for as long as it runs, in any container; a segment whose lock can be acquired has no
-owner. Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 and 3.6. Two kinds are not freed:
+on the file ``..._X_el`` in the same folder for as long as it runs, in any container; a segment whose lock can be acquired has
+no owner. Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 and 3.6. Two kinds are not freed:
 ``fast_datasharing_...``, whose owner cannot be determined, and ``..._portN``, which are small and reused by the next process of
 the same domain. That process may miss messages of publishers that wrote to the dead one: they keep using the segment that it
 replaced. Fast DDS repairs that within a second, unless the listener was killed between waiting for a message and processing it
 (SharedMemGlobal.hpp, ``update_status_all_listeners``; Fast-DDS pull request 4737); ``dead_ports_avoided`` handles that case.
-Worse,
-a listener killed while it processed a message can block its publishers: ``port_guard`` and ``PortGuard`` handle that.
+Worse, a listener killed while it processed a message can block its publishers: ``port_guard`` and ``PortGuard`` handle that.
 """
 
 from __future__ import annotations
@@ -90,8 +89,7 @@ class PortGuard:
     """A process that runs briefly after this one was killed, to repair its ports; none if it has no ports.
 
     Lifecycle: New once the participants exist; ``close`` after they are destroyed. Until then it is ``flock`` (1.8 MB), which
-    waits
-    for a lock held by this process, and then executes ``port_guard``.
+    waits for a lock held by this process, and then executes ``port_guard``.
     """
 
     def __init__(self) -> None:

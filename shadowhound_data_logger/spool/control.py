@@ -1,10 +1,9 @@
 """The client of a running node's control socket.
 
-It is a Unix stream socket in the spool, accessible only to its owner (mode 0600). A request is a line of JSON, such as
-``{"do": "flush"}``, and so is its answer: ``{"ok": true, "robot": "thor", ...}``, or
-``{"ok": false, "robot": "thor", "error": "..."}``. A connection may send any number of requests, one after the other. The node
-that starts first has ``control.sock``; another one that shares the spool has ``control-ROBOT.sock``. docs/architecture.md lists
-the requests.
+It is a Unix stream socket in the spool, accessible only to its owner (mode 0600). A request is a line of JSON, such as ``{"do":
+"flush"}``, and so is its answer: ``{"ok": true, "robot": "thor", ...}``, or ``{"ok": false, "robot": "thor", "error": "..."}``.
+A connection may send any number of requests, one after the other. The node that starts first has ``control.sock``; another one
+that shares the spool has ``control-ROBOT.sock``. docs/architecture.md lists the requests.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The front camera: renders the building from the robot's pose, 640 by 480 pixels, a few ms per frame.
 
 An ideal pinhole. Each image column is one ray in the plane; floor and ceiling are looked up by perspective, walls and furniture
-are
-vertical spans of a column. Every pixel becomes one index into the atlas (see ``surfaces``).
+are vertical spans of a column. Every pixel becomes one index into the atlas (see ``surfaces``).
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The messages of the real Go2 driver, filled from the simulated world.
 
 Types, frames, order and QoS are those of go2_ros2_sdk's ``go2_driver_node.py`` and ``ros2_publisher.py``; ``camera/compressed``
-is
-what ``image_transport republish`` makes of its images. Every message object is created once and reused: the result of ``fill`` is
-valid until the next ``fill``.
+is what ``image_transport republish`` makes of its images. Every message object is created once and reused: the result of
+``fill`` is valid until the next ``fill``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The simulated Go2 in its building: its sensor readings at any time, pure and deterministic.
 
 On its patrol everything is a function of (seed, t): no clock, no state, no ROS. A driven robot also depends on its commands.
-``t``
-is in seconds since the start, units are SI, and all sensors derive from one motion, so that they agree.
+``t`` is in seconds since the start, units are SI, and all sensors derive from one motion, so that they agree.
 """
 
 from __future__ import annotations

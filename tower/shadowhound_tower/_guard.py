@@ -2,8 +2,7 @@
 
 A separate program without imports from the package. It ends the server's process group when its standard input is closed or its
 parent exits (so a ``kill -9`` of the owner leaves nothing behind), and exits with the server's exit code. A parent death signal
-to
-the server would not be enough: it is tied to the thread that started it, and does not reach grandchildren.
+to the server would not be enough: it is tied to the thread that started it, and does not reach grandchildren.
 """
 
 from __future__ import annotations

@@ -45,8 +45,7 @@ class Tower:
     """An S3 server and, with ``mlflow=True``, an MLflow server. Lifecycle: New; start; ``stop_s3``/``start_s3`` any number; stop.
 
     ``users`` are further S3 identities by name with SeaweedFS actions such as ``Read:sensor-data`` or ``Write:sensor-data``;
-    MLflow
-    has ``tower``, ``spark`` and the ``robots``. Each start creates new credentials; the data in ``folder`` stays. Not
+    MLflow has ``tower``, ``spark`` and the ``robots``. Each start creates new credentials; the data in ``folder`` stays. Not
     thread-safe.
     """
 

@@ -1,11 +1,9 @@
 """Access control of a Tower's MLflow server: it requires a password, and limits each user to its purpose.
 
 MLflow's own app ``basic-auth`` controls access to experiments and runs; this module adds the rest. The server loads it to check
-the
-password of each request (``authenticate``), so that a user can have two during a change, and to reject requests that a user does
-not need before MLflow handles them: without a rule here, only ``tower`` is allowed. No user can choose where artifacts are
-stored,
-not even ``tower``.
+the password of each request (``authenticate``), so that a user can have two during a change, and to reject requests that a user
+does not need before MLflow handles them: without a rule here, only ``tower`` is allowed. No user can choose where artifacts are
+stored, not even ``tower``.
 
 It uses only the standard library and MLflow's dependencies: the container of compose.yaml has only this file, and runs ``main``.
 """
@@ -55,8 +53,7 @@ APP: Final = ('--app-name', 'basic-auth')
 SOURCES: Final = r'\A((runs|models|mlflow-artifacts):/|s3://lerobot/policies/)[^\r\n]*\Z'
 """Allowed sources of a model's files: the server's own storage, and the policies, for which it has no keys."""
 BODY_BYTES: Final = 32 << 20
-"""Maximum size of a request body that MLflow keeps in memory; the inputs of a run
-may have 17 MB. Artifacts are streamed.
+"""Maximum size of a request body that MLflow keeps in memory; the inputs of a run may have 17 MB. Artifacts are streamed.
 """
 MAX_WRONG, WRONG_S = 10, 60.0
 """After this many wrong passwords within this time an address must wait."""
@@ -199,12 +196,11 @@ _WRONG: Final = WrongPasswords()
 
 def connection(**given: Any) -> Protocol:
     """The protocol of uvicorn, whose app gets no body without authentication and none without a bound, and no request of an
-    address
-    that guesses passwords.
+    address that guesses passwords.
 
     MLflow's app reads each body into memory, and only then calls ``authenticate``. Artifacts are streamed, after it. uvicorn
-    closes a
-    connection that is idle after a request, but neither one that never sends a request nor one that never ends its headers.
+    closes a connection that is idle after a request, but neither one that never sends a request nor one that never ends its
+    headers.
     """
     from uvicorn.protocols.http.h11_impl import H11Protocol  # noqa: PLC0415 - see authenticate
 

@@ -95,9 +95,8 @@ class Server:
 class Ports:
     """Ports that are reserved until ``release``, whether a server listens on them or not.
 
-    Each is held by a bound socket that does not listen: no other process can take it, connections are refused, and a server that
-    sets
-    SO_REUSEADDR, as Go's and Python's do, can listen on it. A server that restarts finds its port free.
+    Each is held by a bound socket that does not listen: no other process can take it, connections are refused, and a server
+    that sets SO_REUSEADDR, as Go's and Python's do, can listen on it. A server that restarts finds its port free.
     """
 
     def __init__(self, host: str) -> None:

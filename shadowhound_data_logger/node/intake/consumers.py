@@ -69,8 +69,7 @@ class TopicChoice:
         """As rosbag2: a match anywhere in the name counts, and hidden topics (a part starts with ``_``) are skipped.
 
         They are not skipped if the expression itself contains ``/_``, as in ``/_service_event$`` and ``/_action/``. Names that
-        are
-        invalid in ROS, which other DDS programs may use, are always skipped: ROS cannot subscribe to them.
+        are invalid in ROS, which other DDS programs may use, are always skipped: ROS cannot subscribe to them.
         """
         assert self._regex is not None
         is_hidden = '/_' in topic and '/_' not in self._regex.pattern

@@ -81,9 +81,8 @@ class FirstOfPeriod:
 class OnChange:
     """Keeps a message whose content, except for its header's stamp, differs from the last one kept.
 
-    ``last_kept_ns`` is the stamp of the newest durable sample: a first message with this stamp is the same one, delivered again,
-    as
-    latched messages are.
+    ``last_kept_ns`` is the stamp of the newest durable sample: a first message with this stamp is the same one, delivered
+    again, as latched messages are.
     """
 
     def __init__(self, *, has_header: bool, last_kept_ns: int = 0) -> None:

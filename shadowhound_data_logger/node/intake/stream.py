@@ -37,8 +37,7 @@ class Senders:
     """Identifies the publisher of a message if the middleware reports its number but not its gid (Jazzy and older).
 
     With one publisher in the graph it is that one. Its successor is detected before the graph shows the change: its numbers
-    restart
-    while the time of sending advances. If the old numbers continue as well, there are two publishers.
+    restart while the time of sending advances. If the old numbers continue as well, there are two publishers.
     """
 
     def __init__(self) -> None:

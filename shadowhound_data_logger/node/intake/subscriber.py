@@ -176,9 +176,8 @@ class Subscriber:
                  others: OtherTypes | None = None) -> None:  # fmt: skip
         """Messages are passed to ``consumers``.
 
-        Without ``others`` the topic has no sensor: nothing is counted here, and other types are reported in the accounts of bags
-        and
-        events.
+        Without ``others`` the topic has no sensor: nothing is counted here, and other types are reported in the accounts of
+        bags and events.
         """
         self.sensor = sensor
         self._others = others

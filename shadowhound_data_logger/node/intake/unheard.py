@@ -48,8 +48,7 @@ class Unheard:
         """``rmw`` and ``robot`` are the RMWs of the node and of the robot.
 
         ``topics`` are those of the sensors, with the type that the settings name or '', and ``known`` returns the gids of a
-        topic's
-        publishers that the node has found.
+        topic's publishers that the node has found.
         """
         self._rmw, self._robot = rmw, robot
         self._topics, self._known = topics, known

@@ -1,8 +1,7 @@
 """Extracts what a mission logs from batches that were just encoded, on the encoders' threads.
 
 It is not a consumer of the intake (``consumers.py``). Only what is logged is deserialized: one message per period of the
-battery's
-and the thermometer's topic, and every kept pose.
+battery's and the thermometer's topic, and every kept pose.
 """
 
 from __future__ import annotations

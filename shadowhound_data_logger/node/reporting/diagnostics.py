@@ -1,10 +1,9 @@
 """The status as ``/diagnostics``: one entry for each topic, the spool, the store, the clock, the workers and the node itself.
 
-Levels: WARN for what should be checked (messages recently missed, dropped or rejected, stalls, an unreachable store, a spool that
-fills up, a clock that is not set or stepped recently), ERROR for what needs action (a thread that fails or failed recently,
-objects
-recently quarantined, rejected credentials, publishers that the robot finds and the node does not), STALE for a topic without a
-publisher. Plain values; ``interface`` converts them to a message if there are subscribers.
+Levels: WARN for what should be checked (messages recently missed, dropped or rejected, stalls, an unreachable store, a spool
+that fills up, a clock that is not set or stepped recently), ERROR for what needs action (a thread that fails or failed
+recently, objects recently quarantined, rejected credentials, publishers that the robot finds and the node does not), STALE for
+a topic without a publisher. Plain values; ``interface`` converts them to a message if there are subscribers.
 """
 
 from __future__ import annotations
