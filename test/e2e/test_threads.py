@@ -95,6 +95,6 @@ def test_the_main_loop_dies(mortal: Mortal) -> None:
     mortal.node.received('/talk', GROUP)
     mortal.order('main', 'round')
     assert mortal.node.wait() == 1
-    assert 'the node ends: SystemExit: 0' in mortal.node.log
+    assert 'the node exits: SystemExit: 0' in mortal.node.log
     row = mortal.node.topic('/talk')
     assert (row['received'], row['stored'], row['open']) == (GROUP, GROUP, 0)
