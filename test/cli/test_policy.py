@@ -273,7 +273,7 @@ def test_stale_metadata_is_reported(team: Team, tmp_path: Path, monkeypatch: pyt
     def said() -> list[bool]:
         status = CliRunner(env={'SHADOWHOUND_HOME': str(tmp_path)}).invoke(cli, ['status', '--json'], standalone_mode=False)
         doctor = CliRunner(env={'SHADOWHOUND_HOME': str(tmp_path)}).invoke(
-            cli, ['doctor', '--role', 'thor', '--only', 'policies', '--json'], standalone_mode=False
+            cli, ['doctor', '--role', 'robot', '--only', 'policies', '--json'], standalone_mode=False
         )
         texts = (team.run('list'), json.loads(team.run('list', '--json'))['stale'], status.output, doctor.output)
         return ['expired on' in text for text in texts]

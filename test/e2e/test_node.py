@@ -127,7 +127,7 @@ def test_without_a_server_the_store_is_a_folder(processes: Processes) -> None:
         ({'queue.max_bytes': 17}, ('queue.max_bytes = 17', 'at least')),
         ({'imu.topics': ['no topic!']}, ("imu.topics = ['no topic!']", 'valid topic names')),
         ({'events.regex': '.*', 'events.conditions': ['x: t!:f < 1']}, ("events.conditions = 'x: t!:f < 1'", 'character 2')),
-        ({'imu.topics': ['/odom']}, ("odom.topics = ['odom', 'utlidar/robot_odom']", '/odom is in imu.topics already')),
+        ({'imu.topics': ['/odom']}, ("odom.topics = ['odom', 'utlidar/robot_odom']", '/odom is already in imu.topics')),
         ({'robot': '../x'}, ("robot = '../x'", 'letters, digits')),
     ],
     ids=['unknown', 'range', 'topic name', 'condition', 'topic twice', 'robot'],
