@@ -137,10 +137,10 @@ def served(home: Path) -> Iterator[str]:
     process = subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
-        told = ''
-        while not told.rstrip().endswith('}'):
-            told += process.stdout.readline()
-        yield json.loads(told)['url']
+        printed = ''
+        while not printed.rstrip().endswith('}'):
+            printed += process.stdout.readline()
+        yield json.loads(printed)['url']
     finally:
         process.terminate()
         process.wait()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.likeness import Embedded
 
 REASONS: Final = {
-    'missing': 'not in the store any more', 'too_large': 'too large', 'changed': 'another content than the catalog says',
+    'missing': 'not in the store any more', 'too_large': 'too large', 'changed': 'content differs from the catalog',
     'unreadable': 'no JPEG, PNG or TIFF that can be decoded, or the model makes no vector of it',
 }  # fmt: skip
 model_option = click.option(
@@ -61,12 +61,11 @@ def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -
         print_json({'model': chosen.digest, 'pictures': found.pictures, 'known': found.known, 'made': found.made,
                     'refused': dict(found.refused), 'took_s': round(took_s, 3)})  # fmt: skip
     else:
-        print_page(*_told(found, chosen.name, took_s))
-    told = report_skipped(left_out)
-    return told or exit_code(finding=bool(found.refused))
+        print_page(*_summary(found, chosen.name, took_s))
+    return report_skipped(left_out) or exit_code(finding=bool(found.refused))
 
 
-def _told(found: Embedded, name: str, took_s: float) -> Iterator[Any]:
+def _summary(found: Embedded, name: str, took_s: float) -> Iterator[Any]:
     yield plain(f'{counted(found.made, "vector")} made by {name} in {duration(took_s)}; {number(found.known)} of '
                 f'{counted(found.pictures, "picture")} had one.')  # fmt: skip
     for reason, count in sorted(found.refused.items()):
@@ -90,8 +89,8 @@ def most_similar(source: Any, like: Path | None, text: str | None, folder: Path 
         raise BadUsage(f'{like or "the text"} cannot be compared: {error}', 'a JPEG, PNG or TIFF is a picture') from error
     found = likeness.like(source, model, wanted, limit=limit, findings=left_out, **flags)
     if found.without:
-        told = f'{number(found.without)} of {counted(found.pictures, "picture")} have no vector by {model.name}'
-        click.echo(f'{told}: shadowhound-data lake embed --model {folder} makes them', err=True)
+        missing = f'{number(found.without)} of {counted(found.pictures, "picture")} have no vector by {model.name}'
+        click.echo(f'{missing}: shadowhound-data lake embed --model {folder} makes them', err=True)
     return found.rows
 
 
