@@ -20,7 +20,7 @@ from lake.making import folder_store
 from live.any_robot import HOSTILE, LATITUDE, LONGITUDE
 from live.test_history import patrol
 from live.test_kinds import cdr
-from live.test_page import CHROMIUM, FLAGS, Served, fits, holds, opened, press
+from live.test_page import CHROMIUM, Served, fits, holds, opened, press
 from live.test_panels import TYPES, transforms
 
 from shadowhound_data_logger.core.options import UploadSettings
@@ -64,15 +64,6 @@ def watching(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watching]:
             yield Watching(processes)
         finally:
             processes.end()
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    api = pytest.importorskip('playwright.sync_api')
-    with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope='module')

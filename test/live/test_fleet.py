@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from lake.gap_parts import lost, mark, tell
 from lake.making import DAY_NS, NOON_NS, add_part, folder_store, row
-from live.test_page import CHROMIUM, FLAGS, HOSTILE, Served, fits, holds, opened
+from live.test_page import CHROMIUM, HOSTILE, Served, fits, holds, opened
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.options import UploadSettings
@@ -76,16 +75,6 @@ def test_data_that_the_robot_had_and_lost_is_worse(robots: Path) -> None:
     tomorrow_ns = NOON_NS + DAY_NS
     tomorrow = {one.robot: one for one in overview(Bucket(settings, 'sensor-data'), Findings(lambda _: None), tomorrow_ns)}
     assert tomorrow['thor'].state(tomorrow_ns)[0] == GOOD
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    api = pytest.importorskip('playwright.sync_api')
-    with (
-        api.sync_playwright() as playwright,
-        closing(playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)) as browser,
-    ):
-        yield browser
 
 
 @pytest.mark.long('a Chromium')

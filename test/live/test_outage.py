@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from live.test_history import patrol
-from live.test_page import CHROMIUM, FLAGS, Served, holds, opened, press
+from live.test_page import CHROMIUM, Served, holds, opened, press
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.options import UploadSettings
@@ -24,16 +23,6 @@ pytestmark = [
     pytest.mark.long('a Chromium and an S3 server'),
     pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium'),
 ]
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    api = pytest.importorskip('playwright.sync_api')
-    with (
-        api.sync_playwright() as playwright,
-        closing(playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)) as browser,
-    ):
-        yield browser
 
 
 def test_the_page_survives_an_outage_of_the_store(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -105,16 +105,6 @@ def watching(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watching]:
             processes.end()
 
 
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    """One for all of them."""
-    api = pytest.importorskip('playwright.sync_api')
-    with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
-        browser.close()
-
-
 def opened(browser: Browser, url: str) -> Page:
     """A tab that remembers what it asked for (``asked``) and what went wrong in it (``wrong``)."""
     page: Any = browser.new_page(viewport={'width': 1280, 'height': 800})

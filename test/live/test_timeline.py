@@ -14,7 +14,7 @@ import pytest
 from lake.gap_parts import lost, mark, tell
 from lake.making import NOON_NS, add_part, folder_store
 from live.test_history import bag, patrol
-from live.test_page import CAUSES, CHROMIUM, FLAGS, HOSTILE, IMU, Served, fits, holds, opened, press
+from live.test_page import CAUSES, CHROMIUM, HOSTILE, IMU, Served, fits, holds, opened, press
 from spool.making import FakeClock, make, new_spool, put
 
 from shadowhound_data_logger.core.clock import SECOND, utc
@@ -42,16 +42,6 @@ def in_chromium(test: Any) -> Any:
     """A test with a browser."""
     skip = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
     return pytest.mark.long('a Chromium')(skip(test))
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    api = pytest.importorskip('playwright.sync_api')
-    with (
-        api.sync_playwright() as playwright,
-        closing(playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)) as browser,
-    ):
-        yield browser
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from lake.test_pull import Field
 from live.test_fleet import store_of
-from live.test_page import CHROMIUM, FLAGS, IMU, Served, holds, opened, press, told_of_names
+from live.test_page import CHROMIUM, IMU, Served, holds, opened, press, told_of_names
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
@@ -28,16 +28,6 @@ FIGURES = 'main :is([data-field], dd, td.n, td.figure, .big, .legend b, [data-va
 UNDEFINED = f"""[...document.querySelectorAll('{FIGURES}')].filter((each) => !each.closest('.list, .gaps-table, .tree')
     && !(each.closest('[title]')?.title.length > 8)).map((each) => each.outerHTML.slice(0, 120))"""
 FIX, BATTERY = 'sensor_msgs/msg/NavSatFix', 'go2_interfaces/msg/LowState'
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    api = pytest.importorskip('playwright.sync_api')
-    with (
-        api.sync_playwright() as playwright,
-        closing(playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)) as browser,
-    ):
-        yield browser
 
 
 def values() -> list[LiveItem]:
