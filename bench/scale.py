@@ -1,6 +1,6 @@
-"""Numbers for fleets of 1, 100 and 10,000 robots, from measured rates: the tables of docs/scale.md.
+"""Numbers for fleets of 1, 100 and 10,000 robots, from measured rates: the tables of docs/scale.md and docs/evidence/scale.md.
 
-Run it as ``python bench/scale.py`` to print them, with ``--write`` to update the page. A test compares the two.
+Run it as ``python bench/scale.py`` to print them, with ``--write`` to update the pages. A test compares them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-PAGE: Final = Path(__file__).resolve().parents[1] / 'docs' / 'scale.md'
+DOCS: Final = Path(__file__).resolve().parents[1] / 'docs'
+PAGE: Final = DOCS / 'scale.md'
 FLEETS: Final = (1, 100, 10_000)
 HOURS: Final = 8
 """Hours per day that a robot works; everything else is for a day of these."""
@@ -127,6 +128,8 @@ HEADS: Final = {
     ),
 }
 TABLES: Final = {'flow': flow, 'catalog': catalog, 'store': store}
+PAGES: Final = {PAGE: ('flow',), DOCS / 'evidence' / 'scale.md': ('catalog', 'store')}
+"""Which page has which tables."""
 
 
 def size(count: float) -> str:
@@ -147,9 +150,9 @@ def markdown(name: str) -> str:
     return '\n'.join(lines)
 
 
-def filled(page: str) -> str:
+def filled(page: str, names: Sequence[str]) -> str:
     """The page with updated tables."""
-    for name in TABLES:
+    for name in names:
         before, rest = page.split(f'<!-- scale {name} -->\n')
         page = f'{before}<!-- scale {name} -->\n{markdown(name)}\n<!-- end {name} -->{rest.partition(f"<!-- end {name} -->")[2]}'
     return page
@@ -158,9 +161,10 @@ def filled(page: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('--write', action='store_true', help='into docs/scale.md')
+    parser.add_argument('--write', action='store_true', help='into the pages')
     if parser.parse_args(arguments).write:
-        PAGE.write_text(filled(PAGE.read_text(encoding='utf-8')), encoding='utf-8')
+        for path, names in PAGES.items():
+            path.write_text(filled(path.read_text(encoding='utf-8'), names), encoding='utf-8')
         return
     print('\n\n'.join(markdown(name) for name in TABLES))
 

@@ -14,23 +14,22 @@ import click
 
 from shadowhound_data_logger.cli.common import MEANINGS
 from shadowhound_data_logger.cli.main import SECTIONS as VERBS
-from shadowhound_data_logger.core.config import Settings
-from shadowhound_data_logger.core.options import DEFAULT_SENSORS, GIBI, GROUPS, MEBI, SensorSettings
+from shadowhound_data_logger.core.options import GIBI, GROUPS, MEBI, SensorSettings
 
 DOCS: Final = Path(__file__).parent
-COLUMNS: Final = ('parameter', 'default', 'allowed', 'live', '')
+COLUMNS: Final = ('parameter', 'default', 'allowed', '')
 HEAD: Final = """\
 # Parameters
 
 *Generated from the code by `make docs`: change `shadowhound_data_logger/core/options.py`, not this page.*
 
-The node runs without any of them. Set them in a parameter file (`--ros-args --params-file my.yaml`) or one by one
+None is required. Set them in a parameter file (`--ros-args --params-file my.yaml`) or one by one
 (`--ros-args -p camera.rate_hz:=5.0`). `shadowhound-data init` writes a file for your robot;
 [generic.yaml](../launch_configs/generic.yaml) is a start for any robot, and
 [go2.yaml](../launch_configs/go2.yaml) has all parameters with the defaults for a Unitree Go2. With an unknown name
-or an invalid value the node exits with code 2, and the message says what is allowed.
+or an invalid value the node exits with code 2 and says what is allowed.
 
-**Live** parameters can be changed while the node runs, the others only when it starts:
+**Live** parameters can be changed while the node runs:
 
     shadowhound-data node set camera.rate_hz 5.0              # on the robot
     ros2 param set /sensor_logger_node camera.rate_hz 5.0     # with ROS, from anywhere
@@ -57,7 +56,7 @@ COMMANDS: Final = """\
 
 *Generated from the code by `make docs`: change `shadowhound_data_logger/cli/`, not this page.*
 
-`shadowhound-data VERB --help` describes each verb with all of its options and more examples. Most print JSON with `--json`.
+`shadowhound-data VERB --help` has all options of a verb, with examples. Most verbs print JSON with `--json`.
 Times are UTC: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
 
 An error names the verb, what is wrong, and on the next line what to do:
@@ -105,8 +104,8 @@ class Section(NamedTuple):
 SECTIONS: Final = (
     Section(
         'Choose what is logged',
-        'SENSOR is the name of any sensor: `camera.rate_hz`. The sensors that exist without any settings are '
-        '[below](#the-sensors).',
+        'SENSOR is the name of any sensor: `camera.rate_hz`. Without settings a Unitree Go2 has '
+        '[these sensors](thor.md#what-is-stored-of-a-unitree-go2); any other robot is logged by the types of its topics.',
         (
             'robot',
             'capture.topics',
@@ -197,12 +196,6 @@ ADVANCED: Final = Section(
         'mission.period_s',
     ),
 )
-OWN: Final = """
-## The sensors
-The sensors of a Unitree Go2 exist without any settings; here are their topics, and their defaults where they differ
-from the ones above. Any other robot is logged by the types of its topics (`capture.topics`).
-
-"""
 ENVIRONMENT: Final = """
 ## Environment variables
 Secrets are read from the environment only: a ROS parameter is visible to everyone on the network.
@@ -316,13 +309,13 @@ def commands() -> str:
 
 
 def _verb(name: str, verb: click.Command) -> Iterator[str]:
-    """The section of a verb: a row for each verb below it, or its examples."""
+    """The section of a verb: a row for each verb below it, or its examples (at most three)."""
     yield f'\n### {name}\n{verb.get_short_help_str(1000)}\n\n'
     if isinstance(verb, click.Group):
-        yield _row('verb', '', 'for example') + '|---|---|---|\n'
+        yield _row('verb', '') + '|---|---|\n'
         yield from _rows((name,), verb)
     else:
-        yield from (f'    {line}\n' for line in _examples(verb))
+        yield from (f'    {line}\n' for line in _examples(verb)[:3])
 
 
 def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
@@ -331,7 +324,7 @@ def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
         if isinstance(verb, click.Group):
             yield from _rows(at, verb)
         else:
-            yield _row(f'`{" ".join(at)}`', verb.get_short_help_str(1000), f'`{_examples(verb)[0]}`')
+            yield _row(f'`{" ".join(at)}`', verb.get_short_help_str(1000))
 
 
 def _examples(verb: click.Command) -> list[str]:
@@ -346,7 +339,7 @@ def parameters() -> str:
         parts += [f'\n## {section.title}\n', f'{section.text}\n\n', _row(*COLUMNS)]
         parts += ['|---' * len(COLUMNS) + '|\n', *(described[name] for name in section.names)]
         if section is SECTIONS[-1]:
-            parts += [OWN, *_sensors(), ENVIRONMENT, *_variables(usual=True)]
+            parts += [ENVIRONMENT, *_variables(usual=True)]
     return ''.join((*parts, OTHERS, *_variables(usual=False)))
 
 
@@ -363,35 +356,22 @@ def _described() -> dict[str, str]:
             '`robot`',
             '',
             'a name',
-            '',
             "The first part of every key. If empty: `SHADOWHOUND_ROBOT`, otherwise the node's namespace, otherwise `thor` if the "
             'messages of a Go2 are installed, otherwise the host name.',
         ),
         'sensors': _row(
             '`sensors`',
-            'all those below',
+            'those of a Go2',
             'names',
-            '',
             'The sensors to log, instead of the default ones. Other names also need `topics` ([how](extending.md#add-a-sensor)).',
         ),
     }
     for prefix, kind in ((SENSOR, SensorSettings), *GROUPS.items()):
         for spec in fields(kind):
             if spec.metadata:
-                name, live = f'{prefix}.{spec.name}', 'yes' if spec.metadata['live'] else ''
-                rows[name] = _row(f'`{name}`', _shown(_default(spec)), _allowed(spec), live, spec.metadata['help'])
+                name, live = f'{prefix}.{spec.name}', '; **live**' if spec.metadata['live'] else ''
+                rows[name] = _row(f'`{name}`', _shown(_default(spec)), _allowed(spec) + live, spec.metadata['help'])
     return rows
-
-
-def _sensors() -> Iterator[str]:
-    """A row for each sensor that exists without any settings, with the defaults in which it differs."""
-    yield _row('sensor', 'topics', 'its defaults')
-    yield '|---|---|---|\n'
-    for sensor in Settings.load({}, {}).sensors:
-        own = DEFAULT_SENSORS[sensor.name]
-        listed = (f'`{name}`: {_shown(value)}' for name, value in own.items() if name not in {'topics', 'types'})
-        topics = (f'`{topic}` ({kind})' for topic, kind in zip(sensor.topics, sensor.types, strict=True))
-        yield _row(f'`{sensor.name}`', '<br>'.join(topics), '<br>'.join(listed))
 
 
 def _default(spec: Field[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""The tables of docs/scale.md are what the program computes from the rates that it names."""
+"""The tables of docs/scale.md and docs/evidence/scale.md are what the program computes from the rates that it names."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ def scale() -> Any:
     return module
 
 
-def test_the_page_has_its_tables(scale: Any) -> None:
+def test_the_pages_have_their_tables(scale: Any) -> None:
     """``python bench/scale.py --write`` would change nothing."""
-    page = scale.PAGE.read_text(encoding='utf-8')
-    assert scale.filled(page) == page
-    assert page.count('<!-- scale ') == len(scale.TABLES)
+    assert sorted(name for names in scale.PAGES.values() for name in names) == sorted(scale.TABLES)
+    for path, names in scale.PAGES.items():
+        page = path.read_text(encoding='utf-8')
+        assert scale.filled(page, names) == page
+        assert page.count('<!-- scale ') == len(names)
 
 
 def test_the_rates_are_those_of_the_other_pages(scale: Any) -> None:

@@ -1,4 +1,24 @@
-"""Assembles the stages of the node: opened from the store to the robot, closed in reverse order."""
+"""Assembles the stages of the node: opened from the store to the robot, closed in reverse order.
+
+The threads of the node, what each owns, and what it may wait for (``top -H -p PID`` shows the names):
+
+- main: the executor (services, parameters, requests of the control socket), status and ``/diagnostics`` once per second; waits
+  for a flush, for 5 s, and for the disk, to record an operator's request
+- ``control``: the control socket and its clients, which have deadlines
+- ``front``: the process of the front; waits for its end, when the node ends
+- ``intake``: all subscriptions. It alone creates, takes from and destroys them, and waits for nothing
+- ``encode-*`` (two to four): the batch in hand; wait for the spool writer
+- ``spool-writer``: commits; waits for the disk
+- ``bag-writer``, ``event-writer``: the open slice, the bag of the current event; wait for the disk, and at the end for the spool
+  writer, for 5 s
+- ``bag-recovery``: interrupted bags, and those that wait for the clock; waits for the disk
+- ``event-watch``: conditions, and the end of the active mission's journal; waits for the disk
+- ``upload-*`` (``upload.threads``): the object in hand; wait for the network
+- ``requests`` (where something is kept): the mailbox, and what is released next; waits for network and disk
+- ``upload-lock``: the right to deliver, which one process has at a time; waits for the other process
+- ``mission``: the active mission, and the node's journal of it; waits for the disk, and at a mission's end for intake and
+  encoders, for 5 s
+"""
 
 from __future__ import annotations
 

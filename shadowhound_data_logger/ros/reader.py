@@ -2,6 +2,19 @@
 
 If rclpy reports less about a message than its RMW knows (Humble: neither number nor publisher; Jazzy and the first Kilted: no
 publisher), messages are taken through librcl, after that was verified with messages of the node to itself.
+
+What it needs beyond rclpy's documented interface, from the sources of rclpy 8.0.0 (Rolling, ``ba72a017``) and rmw (``33118c9d``);
+``test/node/test_innards.py`` checks each on the installed rclpy:
+
+- ``Subscription.handle``, a context manager with ``take_message(type, raw)`` and ``pointer``: without it nothing is taken
+- keys of the information about a message: ``source_timestamp``, ``received_timestamp`` and, where the distribution has them,
+  ``publication_sequence_number`` and ``publisher_gid`` (since 10.0.0 and 9.1.1): otherwise not numbered, or without a publisher
+- ``handle.get_publisher_count``: otherwise librcl is asked
+- ``CallbackGroup.entities``, ``add_entity``, ``can_execute``, ``beginning_execution``, ``ending_execution``: otherwise a
+  subscription is put into a wait set
+- ``SubscriptionEventCallbacks(use_default_callbacks=False)``: otherwise events spin the executor (docs/decisions/0002)
+- in librcl the layouts of ``rmw_message_info_t``, ``rcutils_uint8_array_t`` and ``rcutils_allocator_t``: otherwise the
+  verification fails, and messages are taken through rclpy
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """Stores for objects: S3 or a folder, with one Protocol (``base.py``) and one table of errors (``s3_errors.py``).
 
+A put is confirmed only when the content has been verified, and never overwrites. All stores pass the same tests.
+
 ``bandwidth.py`` limits the upload rate, ``core/retry.py`` retries, ``download.py`` downloads objects to files.
 """
 

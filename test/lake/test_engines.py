@@ -1,4 +1,4 @@
-"""Other engines open the tables of the lake: the unchanged lines of docs/lake.md, on a real S3 server."""
+"""Other engines open the tables of the lake: the unchanged lines of docs/api/lake.md, on a real S3 server."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from shadowhound_data_logger.lake.row_files import Scope, row_files
 from shadowhound_data_logger.lake.tables import Tables
 from shadowhound_data_logger.stores import open_store
 
-PAGE = Path(__file__).parents[2] / 'docs' / 'lake.md'
+PAGE = Path(__file__).parents[2] / 'docs' / 'api' / 'lake.md'
 COUNTS = {'camera': 3, 'odom': 2}
 RUN = """
 import ast, json, sys

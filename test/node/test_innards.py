@@ -1,4 +1,4 @@
-"""What the reader asks of rclpy beyond its documented interface is there (the table in docs/development.md)."""
+"""What the reader asks of rclpy beyond its documented interface is there (the list in ros/reader.py)."""
 
 from __future__ import annotations
 
