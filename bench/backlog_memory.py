@@ -24,7 +24,7 @@ SETTINGS = Path(__file__).resolve().parents[1] / 'launch_configs' / 'go2_full_ra
 SENSORS = ('camera', 'camera_info', 'lidar', 'imu', 'states', 'joints', 'odom', 'lowstate')
 RING = 64 << 20
 PARAMETERS: dict[str, Any] = {
-    'upload.backoff_s': 5.0, 'bag.record': 'always', 'bag.slice_s': 10.0, **{f'{sensor}.batch_s': 0.2 for sensor in SENSORS},
+    'upload.max_backoff_s': 5.0, 'bag.record': 'always', 'bag.slice_s': 10.0, **{f'{sensor}.batch_s': 0.2 for sensor in SENSORS},
     'events.regex': '.*', 'events.exclude': 'rosout|parameter_events|sensor_logger_node|diagnostics', 'events.pre_s': 60.0,
     'events.max_bytes': RING,
 }  # fmt: skip

@@ -73,7 +73,7 @@ class Watch:
 def measure(options: argparse.Namespace) -> Report:
     with World(options.folder) as world:
         assert world.tower is not None
-        node = world.node({'upload.backoff_s': BACKOFF_S}, file=SETTINGS)
+        node = world.node({'upload.max_backoff_s': BACKOFF_S}, file=SETTINGS)
         sim = world.sim()
         until(lambda: len(world.ledger()['topics']) > 1, 'the node to hear the robot', node, sim)
         time.sleep(WARM_S)

@@ -52,7 +52,7 @@ def run(options: argparse.Namespace, seconds: float, away_s: float = 0.0) -> tup
     """
     count = round(RATE_HZ * seconds)
     with World(options.folder) as world:
-        node = world.node({**PARAMETERS, 'upload.backoff_s': 1.0}, program=('timed_node.py',))
+        node = world.node({**PARAMETERS, 'upload.max_backoff_s': 1.0}, program=('timed_node.py',))
         sim = world.sim()
         publisher = world.program('imu_publisher', 'imu_publisher.py', '--topic', TOPIC)
         publisher.ask(subscribers=1)

@@ -30,7 +30,7 @@ from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.formats.encoders import encode
 from shadowhound_data_logger.formats.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.node.intake.intake import until_poll
-from shadowhound_data_logger.node.intake.sampling import Batcher, KeepRule, rule_for
+from shadowhound_data_logger.node.intake.sampling import Batcher, SamplingRule, rule_for
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, endpoints
 from shadowhound_data_logger.stores import open_store
@@ -55,7 +55,7 @@ class Topic:
         plan = Plan(topic, publisher.type, reliable=publisher.reliable, transient_local=False, depth=DEPTH)
         self.sensor, self.reader = sensor, Reader(node, plan, PolledGroup())
         self.has_header = types.has_header(publisher.type)
-        self.rule: KeepRule = rule_for(sensor, has_header=self.has_header, last_kept_ns=0)
+        self.rule: SamplingRule = rule_for(sensor, has_header=self.has_header, last_stored_ns=0)
         self.batcher = Batcher(sensor, topic, publisher.type)
 
 
@@ -98,7 +98,7 @@ class LeastNode:
         for message in topic.reader.drain():
             header_ns = header_stamp_ns(message.cdr) if topic.has_header else 0
             stamp_ns = self._stamps.date(header_ns, message.source_ns, message.received_ns).ns
-            if topic.rule.keep(stamp_ns, message.cdr):
+            if topic.rule.selects(stamp_ns, message.cdr):
                 yield from topic.batcher.add(Sample(stamp_ns, message.cdr), time.monotonic())
 
     def _spool(self, objects: list[DataObject]) -> list[SpooledObject]:

@@ -182,7 +182,7 @@ ADVANCED: Final = Section(
         'catalog.enabled',
         'catalog.period_s',
         'upload.threads',
-        'upload.backoff_s',
+        'upload.max_backoff_s',
         'upload.read_timeout_s',
         'shutdown.drain_s',
         'keep.preview_s',

@@ -65,7 +65,7 @@ def test_the_full_rate_keeps_every_message() -> None:
     for sensor in settings.sensors:
         assert sensor.enabled, sensor.name
         assert sensor.batch_s == 1.0, sensor.name
-        assert isinstance(rule_for(sensor, has_header=True, last_kept_ns=0), EveryMessage), sensor.name
+        assert isinstance(rule_for(sensor, has_header=True, last_stored_ns=0), EveryMessage), sensor.name
 
 
 def test_the_full_rate_says_only_what_differs() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
-class Bar:
+class Check:
     """One requirement, and what was found."""
 
     what: str
@@ -77,7 +77,7 @@ def progress(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def verdict(figures: Mapping[str, Any], bars: Sequence[Bar], *, as_json: bool) -> int:
+def verdict(figures: Mapping[str, Any], bars: Sequence[Check], *, as_json: bool) -> int:
     """Print bars (and with JSON the results); returns the exit code: 0 if every bar is met, otherwise 1."""
     passed = all(bar.holds for bar in bars)
     if as_json:

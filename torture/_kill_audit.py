@@ -26,7 +26,7 @@ from e2e.witness import recorded
 from pypcd4.pypcd4 import PointCloud
 
 from shadowhound_data_logger.stores.base import ObjectStore
-from torture._command import Bar, some
+from torture._command import Check, some
 
 SECOND: Final = 10**9
 BUCKET: Final = 'sensor-data'
@@ -72,10 +72,10 @@ class Audit:
     samples: int = 0
     gaps: dict[str, list[Gap]] = field(default_factory=dict)
 
-    def bars(self) -> list[Bar]:
+    def bars(self) -> list[Check]:
         whats = ('torn', 'overwritten', 'duplicate', 'foreign', 'unequal', 'unaccounted', 'unbalanced', 'not delivered',
                  'lost without a kill', 'lost beyond the bar')  # fmt: skip
-        return [Bar(f'0 {what}', not self.wrong[what], some(self.wrong[what])) for what in whats]
+        return [Check(f'0 {what}', not self.wrong[what], some(self.wrong[what])) for what in whats]
 
     def losses(self) -> dict[str, dict[str, float]]:
         """By topic, over all gaps: samples and milliseconds, median and maximum."""

@@ -27,7 +27,7 @@ from shadowhound_tower.embedded import Tower
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
+from torture._command import Check, parse_kills, parser, progress, verdict, workshop
 from torture._kill_audit import HEADERLESS
 from torture.kills import ROBOT, running
 
@@ -63,11 +63,11 @@ class Found:
     def fail(self, what: str, text: str) -> None:
         self.wrong.setdefault(what, []).append(text)
 
-    def bars(self) -> Iterator[Bar]:
+    def bars(self) -> Iterator[Check]:
         late = [(lost, allowed) for lost, allowed in zip(self.lost_ms, self.allowed_ms, strict=True) if lost > allowed]
-        yield Bar('loss per kill at most 1 s and a chunk', not late, f'worst {max(self.lost_ms, default=0)} ms {late or ""}')
+        yield Check('loss per kill at most 1 s and a chunk', not late, f'worst {max(self.lost_ms, default=0)} ms {late or ""}')
         for what in ('slices open in other readers', 'equal bytes in the same order', 'nothing is twice', 'the ledger knows all'):
-            yield Bar(what, not self.wrong.get(what), '; '.join(self.wrong.get(what, [])[:3]))
+            yield Check(what, not self.wrong.get(what), '; '.join(self.wrong.get(what, [])[:3]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ from shadowhound_data_logger.spool.estimator import RESTART
 from shadowhound_data_logger.spool.gaps import BAGS, OBJECTS
 from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.stores import open_store
-from torture._command import Bar, parser, progress, some, verdict, workshop
+from torture._command import Check, parser, progress, some, verdict, workshop
 from torture._skewed import BORDER, IMAGE, STREAMS, Skewed, number_in, witnessed
 
 ROBOT: Final = 'torture'
@@ -132,8 +132,8 @@ class Bars:
             wrong.append(text)
         return holds
 
-    def all(self) -> list[Bar]:
-        return [Bar(f'{what} ({self.counts[what]:,} checks)', not wrong, some(wrong)) for what, wrong in self._wrong.items()]
+    def all(self) -> list[Check]:
+        return [Check(f'{what} ({self.counts[what]:,} checks)', not wrong, some(wrong)) for what, wrong in self._wrong.items()]
 
 
 BY_TOPIC: Final = {stream.topic: stream for stream in STREAMS}

@@ -16,7 +16,7 @@ from domains import free_domain
 from e2e.processes import Node, Processes
 
 from shadowhound_data_logger.spool.ledger import imbalances
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 
 TOPICS: Final = 600
 PUBLISHERS: Final = 3000
@@ -109,10 +109,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             processes.end()
         above, left = found['peak'] - found['before'], found['after'] - found['before']
         bars = [
-            Bar('memory at most', above <= PEAK_BYTES, f'{above / 1e6:.1f} MB above {found["before"] / 1e6:.1f} MB'),
-            Bar('memory afterwards', left <= AFTER_BYTES, f'{left / 1e6:.1f} MB above it'),
-            Bar('the ledger balances', not found['imbalances'], '; '.join(found['imbalances'])),
-            Bar('no thread fails', not found['failures'], f'{found["failures"]} in the log' if found['failures'] else ''),
+            Check('memory at most', above <= PEAK_BYTES, f'{above / 1e6:.1f} MB above {found["before"] / 1e6:.1f} MB'),
+            Check('memory afterwards', left <= AFTER_BYTES, f'{left / 1e6:.1f} MB above it'),
+            Check('the ledger balances', not found['imbalances'], '; '.join(found['imbalances'])),
+            Check('no thread fails', not found['failures'], f'{found["failures"]} in the log' if found['failures'] else ''),
         ]
         shop.passed = all(bar.holds for bar in bars)
         return verdict(found, bars, as_json=given.json)

@@ -15,7 +15,7 @@ from faults.kinds import given_seed
 from faults.report import Summary
 from shadowhound_tower.embedded import Tower
 
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 
 LONG: Final = 1000, 50
 SHORT: Final = 100, 5
@@ -47,9 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                    [_bar(where, summary) for where, summary in found.items()], as_json=given.json)  # fmt: skip
 
 
-def _bar(where: str, summary: Summary) -> Bar:
+def _bar(where: str, summary: Summary) -> Check:
     what = f'all objects of {summary.days} days {where} are delivered effectively exactly once'
-    return Bar(what, not summary.failures, ', '.join(f'not with seed {seed}' for seed in summary.failures))
+    return Check(what, not summary.failures, ', '.join(f'not with seed {seed}' for seed in summary.failures))
 
 
 if __name__ == '__main__':

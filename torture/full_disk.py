@@ -35,7 +35,7 @@ from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.retention import NO_ROOM
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 from torture._disks import MEBI, Disk, NotAllowed, inside, small_disk
 from torture.kills import PARAMETERS, ROBOT, running
 
@@ -66,8 +66,8 @@ class Findings:
         if not holds:
             lines.append(str(found))
 
-    def bars(self) -> list[Bar]:
-        return [Bar(what, not lines, '; '.join(lines[:3])) for what, lines in self.wrong.items()]
+    def bars(self) -> list[Check]:
+        return [Check(what, not lines, '; '.join(lines[:3])) for what, lines in self.wrong.items()]
 
 
 class FullDisk:

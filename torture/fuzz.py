@@ -29,7 +29,7 @@ from formats.hostile import Fuzzer
 from spool import editing, rotting
 
 from torture import _readers
-from torture._command import Bar, parser, progress, verdict
+from torture._command import Check, parser, progress, verdict
 from torture.rot import SHARED_MEMORY
 
 SECONDS: Final = 600.0
@@ -164,16 +164,16 @@ def _fuzz_readers(given: argparse.Namespace, seconds: float) -> int:
             print(f'{result.rounds} rounds of {kind}, {result.peak_bytes / 1e6:.0f} MB at most: {found}')
             print(*(f'    {wrong}' for wrong in result.wrong), sep='\n', end='\n' if result.wrong else '')
     what = 'no error but ours, nothing written elsewhere, in 2 GB'
-    bars = [Bar(f'readers of {kind}: {what}', not result.wrong and result.rounds > 0,
+    bars = [Check(f'readers of {kind}: {what}', not result.wrong and result.rounds > 0,
                 f'{len(result.wrong)} of {result.rounds} rounds' if result.wrong else '')
             for kind, result in report.items()]  # fmt: skip
     return verdict({'seed': given.seed, 'seconds': seconds, **{kind: each.as_dict() for kind, each in report.items()}}, bars,
                    as_json=given.json)  # fmt: skip
 
 
-def _bar(what: str, result: Field) -> Bar:
+def _bar(what: str, result: Field) -> Check:
     found = f'{len(result.wrong)} of {result.rounds} rounds' if result.wrong else ''
-    return Bar(f'hostile {what}: no crash, no hang, nothing damaged passes as good', not result.wrong, found)
+    return Check(f'hostile {what}: no crash, no hang, nothing damaged passes as good', not result.wrong, found)
 
 
 if __name__ == '__main__':

@@ -40,7 +40,7 @@ from shadowhound_data_logger.spool.gaps import OBJECTS, Gap
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import retry
 from shadowhound_data_logger.spool.topic_account import WRONG_TYPE
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 from torture._disks import Disk, NotAllowed, small_disk
 from torture.losses import quiet
 
@@ -131,8 +131,8 @@ class Found:
         if not holds:
             self.wrong[bar].append(text)
 
-    def bars(self) -> list[Bar]:
-        return [Bar(what, not reported, '; '.join(reported[:3])) for what, reported in self.wrong.items()]
+    def bars(self) -> list[Check]:
+        return [Check(what, not reported, '; '.join(reported[:3])) for what, reported in self.wrong.items()]
 
 
 class Reader:

@@ -32,7 +32,7 @@ from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.pictures import NAMES
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
+from torture._command import Check, parse_kills, parser, progress, verdict, workshop
 from torture.kills import ROBOT, running
 
 KILLS: Final = 50
@@ -51,7 +51,7 @@ LAST_NS: Final = SECOND
 """Messages published this shortly before the agent is killed may reach the node after it knows of the end."""
 PARAMETERS: Final[dict[str, Any]] = {
     'mission.frame_every_s': 1.0, 'lowstate.batch_s': 1.0,
-    'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
+    'upload.read_timeout_s': 3.0, 'upload.max_backoff_s': 2.0,
 }  # fmt: skip
 
 
@@ -274,9 +274,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = parse_kills(parser('joined', __doc__ or ''), argv, usual=KILLS, short=SHORT_KILLS)
     with workshop(given) as shop:
         found, counts = campaign(shop.folder, given.kills, given.seed)
-        bars = [Bar(text, not found.wrong[name], '; '.join(found.wrong[name][:3])) for name, text in WHAT.items()]
+        bars = [Check(text, not found.wrong[name], '; '.join(found.wrong[name][:3])) for name, text in WHAT.items()]
         looked = {name: found.looked[name] for name in ('points', 'poses', 'frames', 'node frames', 'marked')}
-        bars.append(Bar('there was something to look at', all(looked.values()), str(dict(found.looked))))
+        bars.append(Check('there was something to look at', all(looked.values()), str(dict(found.looked))))
         shop.passed = all(bar.holds for bar in bars)
     return verdict({'seed': given.seed, 'kills': dict(counts), 'looked': dict(found.looked)}, bars, as_json=given.json)
 

@@ -48,7 +48,7 @@ from shadowhound_data_logger.lake.row_files import RowFile, read
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
+from torture._command import Check, parse_kills, parser, progress, verdict, workshop
 from torture._disks import Disk, NotAllowed, inside, small_disk
 
 ROBOT: Final = 'thor'
@@ -79,7 +79,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     'bag.record': 'always', 'bag.topics': ['/odom', '/imu', '/point_cloud2'], 'bag.slice_s': 5.0, 'bag.compression': 'none',
     'bag.ship': 'on_request',
     'keep.max_bytes': 64 << 20, 'keep.poll_s': 0.5, 'catalog.period_s': 2.0,
-    'upload.max_mbps': 8.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
+    'upload.max_mbps': 8.0, 'upload.read_timeout_s': 3.0, 'upload.max_backoff_s': 2.0,
 }  # fmt: skip
 NO_ROOM: Final = {'spool.min_free_bytes': 1 << 60}
 """A reserve that no disk has: everything that may be evicted is."""
@@ -343,7 +343,7 @@ class Campaign:
         until(are_answered, lambda: f'{len(made)} requests are answered: {sorted(made)[:3]} {self._node.log[-2000:]}', WAIT_S)
 
 
-def audit(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any], list[Bar]]:
+def audit(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any], list[Check]]:
     """The results and bars."""
     wrong: dict[str, list[str]] = {name: [] for name in (
         'unbalanced', 'unanswered or contradictory', 'seen and neither stored nor accounted for', 'not what was spooled',
@@ -384,7 +384,7 @@ def audit(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any],
     spool.close()
     figures['faults while requests were open'] = dict(campaign.exercised)
     figures['asked in vain, for the store was away'] = campaign.failed
-    bars = [Bar(f'{len(found)} {what}', not found, '; '.join(found[:3])) for what, found in wrong.items()]
+    bars = [Check(f'{len(found)} {what}', not found, '; '.join(found[:3])) for what, found in wrong.items()]
     return figures, bars
 
 

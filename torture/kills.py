@@ -26,7 +26,7 @@ from shadowhound_tower.embedded import Tower
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
+from torture._command import Check, parse_kills, parser, progress, verdict, workshop
 from torture._kill_audit import BEST_EFFORT, Audit, Heard, Kill, audit
 
 KILLS: Final = 100
@@ -42,7 +42,7 @@ DELIVER_S: Final = 300.0
 PARAMETERS: Final[dict[str, Any]] = {
     **{f'{name}.rate_hz': 0.0 for name in ('camera', 'lidar', 'odom', 'lowstate')},
     'odom.batch_s': 1.0, 'lowstate.batch_s': 1.0,
-    'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
+    'upload.read_timeout_s': 3.0, 'upload.max_backoff_s': 2.0,
 }  # fmt: skip
 """Every message is stored; and a store that is up again is detected within the life of a node."""
 READY: Final = re.compile(r'\[(\d+\.\d+)\].*: logging ')
@@ -188,7 +188,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     with workshop(given) as shop:
         run, found = campaign(shop.folder, given.kills, given.seed)
-        bars = [Bar('kills', len(run.kills) == given.kills, str(given.kills)), *found.bars()]
+        bars = [Check('kills', len(run.kills) == given.kills, str(given.kills)), *found.bars()]
         shop.passed = all(bar.holds for bar in bars)
     losses = found.losses()
     if not given.json:

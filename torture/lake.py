@@ -34,7 +34,7 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import ingest
 from shadowhound_data_logger.lake.tables import OBJECT_ROWS, Tables, answer, engine
 from shadowhound_data_logger.stores import open_store
-from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
+from torture._command import Check, parse_kills, parser, progress, verdict, workshop
 
 KILLS: Final = 100
 SHORT_KILLS: Final = 12
@@ -104,7 +104,7 @@ class Campaign:
         self.interrupted = 0
         """Queries that ended with an error because the server was stopped."""
 
-    def run(self) -> tuple[Bar, ...]:
+    def run(self) -> tuple[Check, ...]:
         with Tower(self._folder / 'tower') as tower:
             self._make_buckets(tower)
             os.environ.update(tower.environment(), SHADOWHOUND_HOME=str(self._folder / 'home'))
@@ -163,7 +163,7 @@ class Campaign:
             client.create_bucket(Bucket=name)
         client.close()
 
-    def _bars(self, source: Bucket, writer: Writer) -> tuple[Bar, ...]:
+    def _bars(self, source: Bucket, writer: Writer) -> tuple[Check, ...]:
         tables = Tables.for_ingest(source)
         ingest(source, tables, Findings())
         with engine({'objects': tables.open(OBJECT_ROWS)}) as ready:
@@ -171,11 +171,11 @@ class Campaign:
         expected = Counter(writer.delivered)
         lost, more = sum((expected - found).values()), sum((found - expected).values())
         return (
-            Bar(f'{self.queries} queries were answered', self.queries > 0, f'{self.interrupted} ended with an error'),
-            Bar('no query lacks a row', not self.absent, str(self.absent or '')),
-            Bar('no query sees a row twice', not self.twice, str(self.twice or '')),
-            Bar(f'the tables have all {len(writer.delivered):,} rows', not lost, str(lost or '')),
-            Bar('and no row twice, and no other', not more, str(more or '')),
+            Check(f'{self.queries} queries were answered', self.queries > 0, f'{self.interrupted} ended with an error'),
+            Check('no query lacks a row', not self.absent, str(self.absent or '')),
+            Check('no query sees a row twice', not self.twice, str(self.twice or '')),
+            Check(f'the tables have all {len(writer.delivered):,} rows', not lost, str(lost or '')),
+            Check('and no row twice, and no other', not more, str(more or '')),
         )
 
 

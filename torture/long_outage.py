@@ -29,7 +29,7 @@ from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores import open_store
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 from torture._profile import arrivals, make, receive
 
 OBJECTS: Final = 40_000
@@ -133,7 +133,7 @@ def bare_rates(folder: Path, tower: Tower, count: int) -> Iterator[list[float]]:
             yield rates
 
 
-def bars(drain: Drain, bare_rate: float, count: int) -> tuple[dict[str, Any], list[Bar]]:
+def bars(drain: Drain, bare_rate: float, count: int) -> tuple[dict[str, Any], list[Check]]:
     """The results, and the requirements."""
     old = [delivery for delivery in drain.deliveries if not delivery.live]
     place = {sensor: statistics.median(n for n, each in enumerate(old) if each.sensor == sensor) / len(old) for sensor in
@@ -153,17 +153,17 @@ def bars(drain: Drain, bare_rate: float, count: int) -> tuple[dict[str, Any], li
     }  # fmt: skip
     objects = drain.ledger['objects']
     return figures, [
-        Bar('everything is delivered, once', objects['delivered'] == objects['spooled'] == len(drain.deliveries), str(objects)),
-        Bar('the ledger balances', not ledger.imbalances(drain.ledger)),
-        Bar('memory is flat', max(rss) - rss[0] <= FLAT_MB and max(rss) <= MAX_MB, str(figures['rss_mb'])),
-        Bar('small state topics go first', max(place[name] for name in SMALL) < min(place[name] for name in LARGE)),
-        Bar('the oldest do not starve', oldest_share >= 0.1, f'{oldest_share:.2f} of the large in the first half'),
-        Bar('what is new does not starve', in_time >= 0.9, f'{in_time:.2f} within {LIVE_S:g} s: {figures["live_wait_s"]}'),
-        Bar('the pace of the store', drain.rate >= RATE * bare_rate, f'{figures["ratio"]} of the bare rate'),
+        Check('everything is delivered, once', objects['delivered'] == objects['spooled'] == len(drain.deliveries), str(objects)),
+        Check('the ledger balances', not ledger.imbalances(drain.ledger)),
+        Check('memory is flat', max(rss) - rss[0] <= FLAT_MB and max(rss) <= MAX_MB, str(figures['rss_mb'])),
+        Check('small state topics go first', max(place[name] for name in SMALL) < min(place[name] for name in LARGE)),
+        Check('the oldest do not starve', oldest_share >= 0.1, f'{oldest_share:.2f} of the large in the first half'),
+        Check('what is new does not starve', in_time >= 0.9, f'{in_time:.2f} within {LIVE_S:g} s: {figures["live_wait_s"]}'),
+        Check('the pace of the store', drain.rate >= RATE * bare_rate, f'{figures["ratio"]} of the bare rate'),
     ]
 
 
-def campaign(folder: Path, count: int) -> tuple[dict[str, Any], list[Bar]]:
+def campaign(folder: Path, count: int) -> tuple[dict[str, Any], list[Check]]:
     """Fill, drain, audit."""
     began = time.monotonic()
     fill(folder / 'spool', count)

@@ -30,7 +30,7 @@ from e2e.processes import Node, Processes, Publisher, until
 
 from shadowhound_data_logger.spool.estimator import RESTART
 from shadowhound_data_logger.spool.gaps import EXACT
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 
 ROUNDS: Final = 10
 SHORT_ROUNDS: Final = 1
@@ -232,8 +232,8 @@ class Found:
         if not holds:
             self.wrong[bar].append(text)
 
-    def bars(self) -> list[Bar]:
-        return [Bar(what, not reported, '; '.join(reported[:3])) for what, reported in self.wrong.items()]
+    def bars(self) -> list[Check]:
+        return [Check(what, not reported, '; '.join(reported[:3])) for what, reported in self.wrong.items()]
 
 
 def audit(found: Found, who: str, ledger: Mapping[str, Any], truths: Mapping[str, Truth], done: Counter[str]) -> None:

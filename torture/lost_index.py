@@ -48,7 +48,7 @@ from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture import joined
-from torture._command import Bar, parser, progress, some, verdict, workshop
+from torture._command import Check, parser, progress, some, verdict, workshop
 from torture._kill_audit import DISCOVERY_S, LOSS_S, SLACK_S
 from torture.gaps import STRING, Loss, Stream, together
 from torture.kills import ROBOT, running
@@ -77,7 +77,7 @@ PERIODS: Final = 2
 READERS: Final = 4
 PARAMETERS: Final[dict[str, Any]] = {
     'sensors': [stream.topic.strip('/') for stream in STREAMS], 'bag.record': 'always', 'bag.slice_s': 3.0,
-    'catalog.period_s': 5.0, 'upload.backoff_s': 2.0,
+    'catalog.period_s': 5.0, 'upload.max_backoff_s': 2.0,
     **{f'{stream.topic.strip("/")}.{name}': value for stream in STREAMS
        for name, value in (('topics', [stream.topic.strip('/')]), ('types', [STRING]), ('rate_hz', 0.0), ('batch_s', 1.0))},
 }  # fmt: skip
@@ -592,7 +592,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     with workshop(given) as shop:
         found, happened = campaign(shop.folder, rounds, given.seed)
-        bars = [Bar(text, not found.wrong[name], some(found.wrong[name])) for name, text in WHAT.items()]
+        bars = [Check(text, not found.wrong[name], some(found.wrong[name])) for name, text in WHAT.items()]
         shop.passed = all(bar.holds for bar in bars)
     figures = {
         'seed': given.seed, 'seconds': round(time.monotonic() - began), 'damages': Counter(what for what, _ in happened.damages),

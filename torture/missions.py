@@ -30,7 +30,7 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
+from torture._command import Check, parse_kills, parser, progress, verdict, workshop
 
 KILLS: Final = 50
 SHORT_KILLS: Final = 5
@@ -185,9 +185,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             'runs': 'each mission is one run, KILLED at its last record', 'points': 'each point that was logged is there once',
             'artifacts': 'each artifact that was logged is there', 'store': 'each object is in the store once',
         }  # fmt: skip
-        bars = [Bar(text, not found.wrong[name], '; '.join(found.wrong[name][:3])) for name, text in what.items()]
+        bars = [Check(text, not found.wrong[name], '; '.join(found.wrong[name][:3])) for name, text in what.items()]
         bars.append(
-            Bar('points and frames were looked at', found.points > 0 and found.frames > 0, f'{found.points}, {found.frames}')
+            Check('points and frames were looked at', found.points > 0 and found.frames > 0, f'{found.points}, {found.frames}')
         )
         shop.passed = all(bar.holds for bar in bars)
     figures = {'seed': given.seed, 'kills': given.kills, 'points': found.points, 'frames': found.frames}

@@ -33,7 +33,7 @@ from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import PolicyManifest
 from shadowhound_data_logger.policies.registry import CHAMPION, MlflowRegistry
 from shadowhound_data_logger.stores.s3 import S3Store
-from torture._command import Bar, parse_kills, parser, progress, verdict, workshop
+from torture._command import Check, parse_kills, parser, progress, verdict, workshop
 from torture._disks import MEBI, Disk, NotAllowed, small_disk
 
 KILLS: Final = 200
@@ -299,11 +299,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         campaign.fills(-(-given.kills // FULL))
         found, outcomes = campaign.found, campaign.outcomes
         shop.passed = not found
-    bars = [Bar('the active version is whole, verified, and the one before or the one after', not found, '; '.join(found[:5]))]
+    bars = [Check('the active version is whole, verified, and the one before or the one after', not found, '; '.join(found[:5]))]
     if given.kills >= KILLS // 2:
         is_everywhere = all(len(campaign.killed_at[act]) >= steps - SPARE_STEPS for act, steps in campaign.steps.items())
-        bars += [Bar('it was killed at each step', is_everywhere, str(campaign.figures()['killed at steps'])),
-                 Bar('kills came before and after the activation', bool(outcomes['before'] and outcomes['after']),
+        bars += [Check('it was killed at each step', is_everywhere, str(campaign.figures()['killed at steps'])),
+                 Check('kills came before and after the activation', bool(outcomes['before'] and outcomes['after']),
                      f'{outcomes["before"]} before, {outcomes["after"]} after')]  # fmt: skip
     return verdict({'seed': given.seed, **campaign.figures()}, bars, as_json=given.json)
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from spool import rotting
 
-from torture._command import Bar, parser, progress, verdict
+from torture._command import Check, parser, progress, verdict
 
 MINUTES: Final = 10.0
 SHORT_MINUTES: Final = 0.25
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'{rounds} damaged spools, seed {given.seed}; in so many of them:')
         for what, count in found.most_common():
             print(f'{count:8}  {what}')
-    bar = Bar('every damaged spool was started and used', not wrong, f'{len(wrong)} of {rounds} were not' if wrong else '')
+    bar = Check('every damaged spool was started and used', not wrong, f'{len(wrong)} of {rounds} were not' if wrong else '')
     return verdict({'seed': given.seed, 'rounds': rounds, 'found': found, 'wrong': wrong}, [bar], as_json=given.json)
 
 

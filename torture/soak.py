@@ -34,7 +34,7 @@ from shadowhound_data_logger.missions.plots import AMBER, BLUE, DPI, INK, STYLE,
 from shadowhound_data_logger.ros.shared_memory import FOLDER
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.control import NAME, Connection
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 from torture.kills import ROBOT, running
 
 MINUTES: Final = 15.0
@@ -96,7 +96,7 @@ class Soak:
     unbalanced: list[str] = field(default_factory=list)
     verified: dict[str, Any] = field(default_factory=dict)
 
-    def bars(self) -> Iterator[Bar]:
+    def bars(self) -> Iterator[Check]:
         rows = self.ledger['topics']
         report = {topic: rows[topic]['received'] + rows[topic]['missed'] if topic in rows else 0 for topic in self.published}
         open_ends = [
@@ -104,20 +104,20 @@ class Soak:
             for topic, count in self.published.items()
             if not is_accounted(report[topic], count)
         ]
-        yield Bar('every message is received or listed as missed', bool(report) and not open_ends, '; '.join(open_ends))
+        yield Check('every message is received or listed as missed', bool(report) and not open_ends, '; '.join(open_ends))
         dropped = {topic: row['dropped'] for topic, row in rows.items() if row['dropped']}
-        yield Bar('none that was received is dropped', not dropped, str(dropped or ''))
-        yield Bar('the ledger balances, at any time', not self.unbalanced, '; '.join(self.unbalanced[:3]))
+        yield Check('none that was received is dropped', not dropped, str(dropped or ''))
+        yield Check('the ledger balances, at any time', not self.unbalanced, '; '.join(self.unbalanced[:3]))
         found = f'{self.verified["sound"]} of {self.verified["known"]} objects'
-        yield Bar('every object is in the store as it was delivered', bool(self.verified['ok']), found)
+        yield Check('every object is in the store as it was delivered', bool(self.verified['ok']), found)
         for what, most in (('own_mb', FLAT_MB), ('descriptors', FLAT_COUNT), ('threads', FLAT_COUNT), ('shm_mb', 1.0)):
             early, late = self.early_and_late(what)
-            yield Bar(f'{what} do not grow' if what.endswith('s') else f'{what} does not grow', late - early <= most,
+            yield Check(f'{what} do not grow' if what.endswith('s') else f'{what} does not grow', late - early <= most,
                       f'{early:.1f} in the second quarter, {late:.1f} in the last')  # fmt: skip
 
         early, late = self.samples[len(self.samples) // 4], self.samples[-1]
         grown, objects = late.index_mb - early.index_mb, late.delivered - early.delivered
-        yield Bar('the index grows with what it remembers alone', grown <= LOG_MB + objects * INDEX_BYTES / 1e6,
+        yield Check('the index grows with what it remembers alone', grown <= LOG_MB + objects * INDEX_BYTES / 1e6,
                   f'{grown:.1f} MB for {objects} objects')  # fmt: skip
 
     def early_and_late(self, what: str) -> tuple[float, float]:

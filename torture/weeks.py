@@ -59,7 +59,7 @@ from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from torture._command import Bar, parser, progress, verdict, workshop
+from torture._command import Check, parser, progress, verdict, workshop
 
 WEEKS, SHORT_DAYS = 2, 3
 MONDAY_NS: Final = 1_759_708_800 * SECOND
@@ -466,18 +466,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         weeks = Weeks(shop.folder, given.seed)
         weeks.run(days)
         bars = [
-            Bar(
+            Check(
                 'nothing happens that no rule names, and the books agree at every hour',
                 not weeks.faults,
                 '; '.join(weeks.faults[:5]),
             ),
-            Bar(
+            Check(
                 'there was something to thin',
                 weeks.figures['messages thinned'] > 100 * days,
                 f'{weeks.figures["messages thinned"]:,} messages',
             ),
-            Bar('requests were served', weeks.figures['requests served'] > 0, f'{weeks.figures["requests served"]}'),
-            Bar('days ended with a look at the store', weeks.figures['days held against the store'] > 0),
+            Check('requests were served', weeks.figures['requests served'] > 0, f'{weeks.figures["requests served"]}'),
+            Check('days ended with a look at the store', weeks.figures['days held against the store'] > 0),
         ]
         shop.passed = all(bar.holds for bar in bars)
         figures = {'seed': given.seed, 'days': days, 'took_s': round(time.monotonic() - began, 1), **weeks.figures}

@@ -1,7 +1,7 @@
 """What recordings share: the folder of bags, the spool, and the rules for names and clocks.
 
-A bag that starts before the clock of this machine is set is named after its boot. It waits in its folder, as the spool holds
-objects (spool/redating.py), until the clock is set; then it is renamed after its start time. Its times are not changed, because
+A bag that starts before the clock of this machine is set is named after its boot. It waits in its folder, as objects wait in the
+spool (unsynced_objects.py), until the clock is set; then it is renamed after its start time. Its times are not changed, because
 the stamps in the messages cannot be changed either; its manifest has the offset to add. If the clock is not set for too long, or
 the boot ended before it was set, the bag keeps its name.
 """
@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock
-from shadowhound_data_logger.core.dating import Dating
+from shadowhound_data_logger.core.clock_watch import UtcOffsets
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 _LATEST: Final = 1 << 63
@@ -36,7 +36,7 @@ class BagContext:
                  keeps: Callable[[BagState], bool] = lambda _: False) -> None:  # fmt: skip
         """``root`` is the robot's folder of bags; ``writer`` puts them into its spool, under unique names.
 
-        ``hold_s`` and ``offsets`` as in ``Dating``: how long a bag waits for its date, and the clock offsets of other boots.
+        ``hold_s`` and ``offsets`` as in ``UtcOffsets``: how long a bag waits for its date, and the clock offsets of other boots.
         ``keeps`` returns whether the slices of a bag stay on the robot until they are requested.
         """
         self.root = root
@@ -45,7 +45,7 @@ class BagContext:
         self.clock = clock
         self.writer = writer
         self.spool = writer.spool
-        self._dating = Dating(clock, hold_s, offsets)
+        self._offsets = UtcOffsets(clock, hold_s, offsets)
         self._first_ns = clock.wall_ns() - clock.boot_ns()
 
     def unset_clock(self, age_ns: int = 0) -> ClockOf | None:
@@ -105,7 +105,7 @@ class BagContext:
 
     def _offset_ns(self, state: BagState) -> int | None:
         assert state.clock is not None
-        return self._dating.offset_ns(state.clock.boot_id, state.clock.boot_ns)
+        return self._offsets.of(state.clock.boot_id, state.clock.boot_ns)
 
     def _is_taken(self, bag: str, by: BagState | None = None) -> bool:
         """Whether a bag other than ``by`` has the name. A restart may find a bag whose slices were delivered already."""

@@ -183,11 +183,11 @@ def checked(manifest: Manifest) -> Manifest:
     """The manifest unchanged. Raises ValueError, with the path of the field, for a value that no manifest has."""
     if manifest.state not in STATES:
         raise ValueError(f'state is {manifest.state!r:.80} and must be one of {", ".join(sorted(STATES))}')
-    for place, one in enumerate(manifest.slices):
+    for index, one in enumerate(manifest.slices):
         if not is_path(one.file):
-            raise ValueError(f'slices[{place}].file is {one.file!r:.80} and must be the name of a file')
+            raise ValueError(f'slices[{index}].file is {one.file!r:.80} and must be the name of a file')
         if not _SHA256.fullmatch(one.sha256):
-            raise ValueError(f'slices[{place}].sha256 is {one.sha256!r:.80} and must be a SHA-256 in hex')
+            raise ValueError(f'slices[{index}].sha256 is {one.sha256!r:.80} and must be a SHA-256 in hex')
     check_numbers(as_plain(manifest))
     return manifest
 
@@ -198,8 +198,8 @@ def check_numbers(value: Any, at: str = '') -> None:
         for name, part in value.items():
             check_numbers(part, f'{at}.{name}' if at else name)
     elif isinstance(value, list):
-        for place, part in enumerate(value):
-            check_numbers(part, f'{at}[{place}]')
+        for index, part in enumerate(value):
+            check_numbers(part, f'{at}[{index}]')
     elif isinstance(value, int) and not 0 <= value < LIMIT:
         raise ValueError(f'{at} is {value} and must be from 0 to 2^64')
 

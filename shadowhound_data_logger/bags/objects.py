@@ -142,7 +142,7 @@ def _times(state: BagState, start_ns: int, end_ns: int) -> tuple[int, int]:
 
 
 def _clock_marks(state: BagState, *times_ns: int) -> dict[str, str]:
-    """For a bag whose clock was not set: how its date is known, as in spool/redating.py, and log times since boot."""
+    """For a bag whose clock was not set: how its date is known, as in spool/unsynced_objects.py, and log times since boot."""
     clock = state.clock
     if clock is None:
         return {}

@@ -282,8 +282,8 @@ def verdict(found: Ledger, not_logged: Collection[str]) -> Text:
 def _known(found: Ledger, not_logged: Collection[str]) -> str:
     """What the ledger says of all messages: no more than the worst grade among them, and only of what was listened to."""
     topics = found['topics']
-    unheard = [other for row in topics.values() for other in row['other_types'].values() if other['messages'] is None]
-    if unheard or not_logged:
+    uncounted = [other for row in topics.values() for other in row['other_types'].values() if other['messages'] is None]
+    if uncounted or not_logged:
         return 'every message that was received is stored, skipped, or listed as lost; what is not logged is listed above.'
     graded = [{*row['by_grade'], *filter(None, [row['accounting']])} for row in topics.values()]
     worst = [max(grades, key=GRADES.index) for grades in graded if grades]

@@ -164,7 +164,7 @@ def view(page: Page, console: Console) -> list[RenderableType]:
     live = report.state != NOT_RUNNING
     parts: list[RenderableType] = [_head(report), '']
     if live:
-        parts += [*_topics(node.topics, node.middleware.unheard or {}), '']
+        parts += [*_topics(node.topics, node.middleware.undiscovered or {}), '']
     if node.not_logged:
         parts += [plain(f'Not logged: {", ".join(node.not_logged)} (`ledger` says why)', 'dim'), '']
     if live or report.spool:
@@ -213,11 +213,11 @@ def _ended(session: NodeSession | None) -> str:
     return f'; session of {shown_iso(session.started)} UTC cut off, or just beginning'
 
 
-def _topics(topics: Mapping[str, TopicStatus], unheard_of: Collection[str]) -> Iterator[RenderableType]:
+def _topics(topics: Mapping[str, TopicStatus], undiscovered: Collection[str]) -> Iterator[RenderableType]:
     """The table of what arrives, and the names of what does not."""
-    unheard = {topic: row for topic, row in topics.items() if not row.received}
-    silent = [topic for topic, row in unheard.items() if row.enabled and not row.publishers and topic not in unheard_of]
-    off = [topic for topic, row in unheard.items() if not row.enabled]
+    unreceived = {topic: row for topic, row in topics.items() if not row.received}
+    silent = [topic for topic, row in unreceived.items() if row.enabled and not row.publishers and topic not in undiscovered]
+    off = [topic for topic, row in unreceived.items() if not row.enabled]
     rows = {topic: row for topic, row in topics.items() if topic not in (*silent, *off)}
     losses = [name for name in LOSSES if any(getattr(row, name) for row in rows.values())]
     table = plain_table('Messages of this session', ('topic', 'Hz', 'age', 'received', 'stored', 'missed', *losses))

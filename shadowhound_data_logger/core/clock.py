@@ -53,6 +53,12 @@ class SystemClock:
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
+def now_ns(clock: Clock) -> int:
+    """UTC, or the time of the boot clock while UTC is unknown."""
+    wall_ns = clock.wall_ns()
+    return wall_ns if wall_ns >= EARLIEST_SANE_NS else clock.boot_ns()
+
+
 def utc(stamp_ns: int) -> datetime:
     """The UTC datetime of a stamp, to the microsecond."""
     return datetime.fromtimestamp(stamp_ns // SECOND, timezone.utc).replace(microsecond=stamp_ns % SECOND // 1000)

@@ -1,4 +1,4 @@
-"""Compares the wall clock with the boot clock: whether it was ever set, and when it steps.
+"""Compares the wall clock with the boot clock: whether it was ever set, when it steps, and how boot times become UTC.
 
 A robot without a battery for its clock starts in 1970 (or in the year of its image) and learns the time minutes later, or
 never. The boot clock never steps; the difference between the two changes when the wall clock is set.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock
@@ -17,6 +19,34 @@ log = logging.getLogger(__name__)
 
 STEP_NS: Final = SECOND
 """A slewed clock (at most 0.5 ms per second) never moves this far between two polls."""
+
+
+@dataclass(frozen=True, slots=True)
+class UtcOffsets:
+    """UTC minus the boot clock, for objects, bags and missions that began while the clock was not set. Stateless.
+
+    A time before 2024 is a time of the boot clock. Its offset is known as soon as the wall clock is set, and for an earlier boot
+    if it was recorded during that boot. Until then everything without a date waits, because a key, a name or a run cannot be
+    changed later. If the clock is not set for too long, or the boot ended before it was, it is uploaded without a date.
+    """
+
+    clock: Clock
+    hold_s: float
+    """How long an object waits for its date."""
+    recorded: Callable[[], Mapping[str, int]]
+    """The offsets of earlier boots of this machine, by boot id, where known."""
+
+    def of(self, boot_id: str, since_ns: int) -> int | None:
+        """What to add to the boot clock of that boot to get UTC, for something that has waited since ``since_ns``.
+
+        None if it is not known yet: keep waiting. 0 if it will never be known: continue without a date.
+        """
+        if boot_id != self.clock.boot_id:
+            return self.recorded().get(boot_id, 0)
+        wall_ns, boot_ns = self.clock.wall_ns(), self.clock.boot_ns()
+        if wall_ns >= EARLIEST_SANE_NS:
+            return wall_ns - boot_ns
+        return 0 if boot_ns - since_ns > self.hold_s * SECOND else None
 
 
 class ClockWatch:

@@ -68,7 +68,7 @@ def _value(hint: Any, given: Any, at: str) -> Any:
     if is_dataclass(hint):
         return parse(hint, given, at)  # type: ignore[arg-type]
     if origin is tuple and isinstance(given, list):
-        return tuple(_value(arguments[0], part, f'{at}[{place}]') for place, part in enumerate(given))
+        return tuple(_value(arguments[0], part, f'{at}[{index}]') for index, part in enumerate(given))
     if origin is not None and issubclass(origin, Mapping) and isinstance(given, dict):
         return {key: _value(arguments[1], part, f'{at}.{key}') for key, part in given.items()}
     kinds = (float, int) if hint is float else hint

@@ -157,7 +157,7 @@ class UploadSettings:
     connect_timeout_s: float = 5.0
     """Not a parameter: set by the doctor and by tests."""
     read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer of the store.', low=0.1, high=600.0)
-    backoff_s: float = _setting(
+    max_backoff_s: float = _setting(
         60.0, 'Longest pause between two attempts while the store cannot be reached.', low=0.1, high=3600.0
     )
     max_mbps: float = _setting(0.0, 'Maximum megabits per second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)

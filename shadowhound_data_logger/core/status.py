@@ -207,7 +207,7 @@ class RequestStatus:
 
 
 @dataclass(frozen=True, slots=True)
-class UnheardTopic:
+class UndiscoveredTopic:
     """A topic with publishers that the robot's RMW finds and the node does not."""
 
     publishers: int = 0
@@ -228,7 +228,7 @@ class MiddlewareStatus:
     receive_bytes: int | None = None
     """The largest receive buffer of its UDP sockets."""
     dropped_datagrams: int = 0
-    unheard: Mapping[str, UnheardTopic] | None = None
+    undiscovered: Mapping[str, UndiscoveredTopic] | None = None
     """None while the two are not compared."""
 
 

@@ -194,7 +194,7 @@ def _memory(context: Context, driver: list[Process]) -> Iterator[Result]:
             segments=len(found),
             bytes=size,
         )
-    if stuck := settle(folder, is_done=False):
+    if stuck := settle(folder, dry_run=True):
         yield warning(
             'sockets.ports',
             f'leftovers of killed processes in {folder} can block others: {", ".join(stuck)}',

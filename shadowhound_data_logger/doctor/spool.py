@@ -10,10 +10,10 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.errors import SpoolError
-from shadowhound_data_logger.core.status import NodeStatus, SpoolStatus, UnheardTopic
+from shadowhound_data_logger.core.status import NodeStatus, SpoolStatus, UndiscoveredTopic
 from shadowhound_data_logger.doctor.machine import command, lock_holder
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
-from shadowhound_data_logger.node.intake.unheard import REMEDY
+from shadowhound_data_logger.node.intake.undiscovered import REMEDY
 from shadowhound_data_logger.spool import ledger, status
 from shadowhound_data_logger.spool.index import Index
 
@@ -93,20 +93,20 @@ def _node(report: status.NodeReport, folder: Path) -> Iterator[Result]:
             store.last_error or 'the node reports no reason',
             STORE,
         )
-    unheard = node.middleware.unheard or {}
-    yield from _unheard(unheard)
+    undiscovered = node.middleware.undiscovered or {}
+    yield from _undiscovered(undiscovered)
     yield from _front(node)
     missed = {topic: (row.missed or row.missed_estimated or 0) + row.dropped + row.rejected for topic, row in node.topics.items()}
-    listed = tuple(row.text for row in unheard.values())
+    listed = tuple(row.text for row in undiscovered.values())
     for text in report.findings:
         if not text.startswith(('delivery:', 'front fails:', *listed)):
             yield warning('node.status', text, 'reported by the node itself', _status_remedy(text), lost=sum(missed.values()))
 
 
-def _unheard(topics: Mapping[str, UnheardTopic]) -> Iterator[Result]:
+def _undiscovered(topics: Mapping[str, UndiscoveredTopic]) -> Iterator[Result]:
     for row in topics.values():
         yield error(
-            'node.unheard',
+            'node.undiscovered',
             f'{row.text}, for {row.seconds} s',
             'the profile of the node uses other interfaces or peers than programs of the robot, or a firewall is in between',
             f'{REMEDY[0].upper()}{REMEDY[1:]}',

@@ -6,7 +6,7 @@
     sent.json      how far the mission is sent
     summary.json   the summary, once the mission has ended
     pictures.json  notes about the mission's pictures
-    clock.json     the offset to add to times from before the clock was set (dating.py)
+    clock.json     the offset to add to times from before the clock was set (``assign_date``)
     floor.npy      x and y (m) of lidar points, one row each, if the node received any: the floor plan under the trajectory's plot
     trajectory.csv computed by the node from odometry after the mission has ended, if the agent logged no trajectory
     node/          the node's journal, files/ and sent.json
@@ -26,11 +26,12 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, utc
+from shadowhound_data_logger.core.clock_watch import UtcOffsets
 from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import MAX_NAME_BYTES, check_name
-from shadowhound_data_logger.missions.journal import Line, dated, read
+from shadowhound_data_logger.missions.journal import Line, dated, first, read
 
 MISSIONS: Final = 'missions'
 UNIQUE_BYTES: Final = 4
@@ -136,6 +137,24 @@ class MissionFolder:
 
     def set_run(self, run: Run) -> None:
         write_json(self.path / 'run.json', {**asdict(run), 'mission_id': self.mission_id}, durable=True)
+
+    def is_undated(self) -> bool:
+        """Whether the clock was not set when the mission started, and it has no date yet. Raises OSError."""
+        return int(first(self.journal).get('t', EARLIEST_SANE_NS)) < EARLIEST_SANE_NS and self.clock_offset_ns() is None
+
+    def assign_date(self, offsets: UtcOffsets) -> bool:
+        """Date the mission if possible; returns whether its times are final. Raises OSError.
+
+        Until the clock is set, records have the time of the boot clock. The mission is held until then, because the date of a run
+        or a key cannot be changed later. The offset is then written once, and readers of the journal add it.
+        """
+        if not self.is_undated():
+            return True
+        start = first(self.journal)
+        offset_ns = offsets.of(str(start.get('boot_id')), int(start['t']))
+        if offset_ns is not None:
+            self.set_clock_offset_ns(offset_ns)
+        return offset_ns is not None
 
     def sent(self) -> MissionSent:
         """How far the mission is sent; all zero if the file is missing or unreadable, because sending again is harmless."""

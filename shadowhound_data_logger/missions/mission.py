@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, now_ns
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.missions import values
-from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, timestamped_name
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.new_run import NewRun, RunRequests

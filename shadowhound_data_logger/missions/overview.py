@@ -10,9 +10,11 @@ from typing import Any, Final
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.dataclass_json import as_plain, fields_of, parse
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.dating import NO_DATE, REMEDY, is_undated
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, missions, read_json
 from shadowhound_data_logger.missions.state import MissionState, Point
+
+NO_DATE: Final = 'the clock of this machine was not set when the mission started: it is sent once the clock is set'
+REMEDY: Final = 'check with `timedatectl` that this machine reaches a time server'
 
 ACTIVE, UNFINISHED = 'active', 'unfinished'
 """Results of missions without an end: the agent is running; or it was killed, and no sender has closed the mission yet."""
@@ -215,7 +217,7 @@ def report(folder: MissionFolder) -> Report:
     """How far a mission is sent. Reads both journals completely."""
     sent, run = folder.sent(), folder.run()
     count, unsent = map(sum, zip(_counted(folder.journal, sent), _counted(folder.node.journal, folder.node.sent()), strict=True))
-    error, remedy = (NO_DATE, REMEDY) if folder.journal.exists() and is_undated(folder) else ('', '')
+    error, remedy = (NO_DATE, REMEDY) if folder.journal.exists() and folder.is_undated() else ('', '')
     waiting_for, wait_remedy = ('', '') if sent.complete else _waiting_for(folder, unsent)
     if not sent.complete and not error:
         error, remedy = next(iter(errors(folder.path.parent).values()), ('', ''))

@@ -11,11 +11,10 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.core.clock import Clock
+from shadowhound_data_logger.core.clock import Clock, now_ns
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.missions import copies
-from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.policies.folder import PolicyFolder

@@ -27,12 +27,11 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.clock_watch import UtcOffsets
 from shadowhound_data_logger.core.config import Settings
-from shadowhound_data_logger.core.dating import Dating
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.core.retry import backoff
-from shadowhound_data_logger.missions.dating import assign_date
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, write_json
 from shadowhound_data_logger.missions.objects import Spooler
@@ -357,9 +356,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         opened.callback(successor.stop)
         settings, clock = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)}), SystemClock.of_this_machine()
         tracking = open_tracking(options.home, options.experiment)
-        dating = Dating(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot).offsets)
+        offsets = UtcOffsets(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot).offsets)
         replay = Replay(
-            options.home, tracking, Spooler(settings, clock), PictureProcess(), settle=lambda folder: assign_date(folder, dating)
+            options.home, tracking, Spooler(settings, clock), PictureProcess(), settle=lambda folder: folder.assign_date(offsets)
         )
         opened.callback(replay.close)
         run(replay, parent, lambda: bool(signals) or successor.is_waiting)

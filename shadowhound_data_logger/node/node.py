@@ -39,7 +39,7 @@ LISTENER = '_sensor_logger_intake'
 """Name of the listening node if the front has the public one; `ros2 node list` hides names that start with _."""
 NO_SERVICE = 'start_type_description_service'
 """A parameter of rclpy since Jazzy."""
-UNHEARD = 'the parameter file has nothing for {name}, so the defaults apply: start its section with /**, or with that name'
+UNUSED_FILE = 'the parameter file has nothing for {name}, so the defaults apply: start its section with /**, or with that name'
 NO_FRONT = (
     '{rmw} is not installed here, so services, parameters and /diagnostics are not offered to the robot: install it, '
     'or use `shadowhound-data node`'
@@ -163,7 +163,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
         log.info('%d ports in shared memory that killed processes left are not reused', len(avoided))
     node.get_logger().info(f'listening by {middleware.describe()}')
     if '--params-file' in arguments and not Parameters(node).given():  # which is not an error to rcl
-        node.get_logger().warning(UNHEARD.format(name=name))
+        node.get_logger().warning(UNUSED_FILE.format(name=name))
     front = Front(arguments, robot) if middleware.is_foreign and middleware.has_robot else None
     if middleware.is_foreign and front is None:
         node.get_logger().warning(NO_FRONT.format(rmw=middleware.robot))

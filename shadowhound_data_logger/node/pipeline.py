@@ -40,7 +40,7 @@ from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.core import metadata_keys as meta
-from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
+from shadowhound_data_logger.core.clock import SECOND, SystemClock, now_ns, utc
 from shadowhound_data_logger.core.clock_watch import ClockWatch
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
 from shadowhound_data_logger.core.dataclass_json import fields_of
@@ -59,7 +59,7 @@ from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.found_topics import FoundTopics
 from shadowhound_data_logger.node.intake.intake import Intake
 from shadowhound_data_logger.node.intake.sampling import Sampler
-from shadowhound_data_logger.node.intake.unheard import Unheard
+from shadowhound_data_logger.node.intake.undiscovered import UndiscoveredPublishers
 from shadowhound_data_logger.node.keeping.keeping import Keeping, keeps_bag
 from shadowhound_data_logger.node.keeping.link_track import LinkTrack
 from shadowhound_data_logger.node.keeping.upload_rules import KEEP_WHEN, UploadRules
@@ -78,11 +78,11 @@ from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.act_record import ActRecord
 from shadowhound_data_logger.spool.clock_record import ClockRecord
-from shadowhound_data_logger.spool.redating import Redating
+from shadowhound_data_logger.spool.operator_requests import OperatorRequests
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.topic_account import SINKS
+from shadowhound_data_logger.spool.unsynced_objects import UnsyncedObjects
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
 
@@ -112,7 +112,7 @@ class Pipeline:
         self._record = record = ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot, settings.keep)
-        self._redating = Redating(self.spool, self._clock, record, settings.robot)
+        self._unsynced = UnsyncedObjects(self.spool, self._clock, record, settings.robot)
         self._node = ros.node
         self._day = self._today()
         self._due_s = 0.0
@@ -147,10 +147,12 @@ class Pipeline:
         self.writer = SpoolWriter(self.spool, expects=queue.is_busy)
         self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        place = BagContext(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
-                         self._record.offsets, keeps=partial(keeps_bag, settings.bag, settings.keep))  # fmt: skip
-        recovery = BagRecovery(place, settings.bag.priority)
-        self.event_buffer = EventBuffer(node, settings, place, recovery, types)
+        bags_context = BagContext(
+            settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
+            self._record.offsets, keeps=partial(keeps_bag, settings.bag, settings.keep),
+        )  # fmt: skip
+        recovery = BagRecovery(bags_context, settings.bag.priority)
+        self.event_buffer = EventBuffer(node, settings, bags_context, recovery, types)
         # Consumers; topics besides those of the sensors are shared with later consumers.
         bag_queue = BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
@@ -170,12 +172,12 @@ class Pipeline:
         found = None if settings.capture.topics == NAMED else FoundTopics(node, settings.capture.topics, named)
         self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=track.has_pose, found=found,
                              early=self._early)  # fmt: skip
-        self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
+        self.recorder = Recorder(settings.bag, bags_context, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks,
                                    track.place)  # fmt: skip
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._on_mission)
         keeping = Keeping(settings.keep, sensors, settings.robot)
-        marks = self.mission.mark, track.mark, keeping.mark, self._redating.mark
+        marks = self.mission.mark, track.mark, keeping.mark, self._unsynced.mark
         self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe,
                                preview=keeping.preview, reports=RejectionLog(partial(node_of, node)))  # fmt: skip
         self._control = ControlSocket(
@@ -183,10 +185,10 @@ class Pipeline:
         )
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
-                                       self._ros.front, self._make_unheard(), self._requests, self._rules)  # fmt: skip
+                                       self._ros.front, self._make_undiscovered(), self._requests, self._rules)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
-        acts = ActRecord(settings.spool_path, settings.robot, self._clock.wall_ns)
-        self._commands = Commands(stages, self._parameters, self._status, acts, settings.robot, self._ros.name)
+        requests = OperatorRequests(settings.spool_path, settings.robot, self._clock.wall_ns)
+        self._commands = Commands(stages, self._parameters, self._status, requests, settings.robot, self._ros.name)
         self._interface = Interface(self._node, self._commands.answer) if not self._ros.middleware.is_foreign else None
 
     def _open_stages(self, opened: ExitStack) -> None:
@@ -337,12 +339,12 @@ class Pipeline:
         if self._requests is not None:
             self._requests.wake()
 
-    def _make_unheard(self) -> Unheard | None:
+    def _make_undiscovered(self) -> UndiscoveredPublishers | None:
         """None if the node uses the robot's RMW."""
         middleware, node = self._ros.middleware, self._node
         if self._ros.front is None:
             return None
-        return Unheard(middleware.rmw, middleware.robot, lambda: self.intake.wanted,
+        return UndiscoveredPublishers(middleware.rmw, middleware.robot, lambda: self.intake.wanted,
                        lambda topic: {publisher.gid for publisher in endpoints(node, topic)})  # fmt: skip
 
     def _on_mission(self, mission: MissionStatus) -> None:
@@ -368,7 +370,7 @@ class Pipeline:
     def _ship_ledger(self) -> None:
         """A ledger that cannot be read now must not stop the node: the next one includes all its content."""
         try:
-            self.writer.put(self._redating.mark(self._ledger()), wait=False)
+            self.writer.put(self._unsynced.mark(self._ledger()), wait=False)
         except DataLoggerError as error:
             log.warning('the ledger was not shipped: %s', error)
 
@@ -389,19 +391,19 @@ class Pipeline:
     def _name_held(self) -> None:
         """Name the objects that waited for the clock, or as soon as the disk allows it."""
         try:
-            if named := self._redating.step():
+            if named := self._unsynced.step():
                 self.uploader.wake(named)
         except (OSError, sqlite3.Error) as error:
             log.warning('objects that wait for the clock have no names yet: %s', error)
 
     def _ledger(self) -> DataObject:
         """The ledger as an object for the store."""
-        now_ns = self._clock.wall_ns() if self._clock.is_set else self._clock.boot_ns()
+        at_ns = now_ns(self._clock)
         content = ledger.read(self.spool.root, self._settings.robot)
         robot = self._settings.robot
         pattern = f'{robot}/_ledger/{{date}}/{{time}}_ledger.json'
         return DataObject(
-            bucket=LEDGER_BUCKET, key=dated(pattern, now_ns), key_pattern=pattern,
+            bucket=LEDGER_BUCKET, key=dated(pattern, at_ns), key_pattern=pattern,
             body=json.dumps(content, indent=1).encode(), content_type='application/json', sensor='_ledger', topic=None,
-            type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True, metadata={meta.ROBOT: robot},
+            type='', samples=0, t_start_ns=at_ns, t_end_ns=at_ns, priority=0, protected=True, metadata={meta.ROBOT: robot},
         )  # fmt: skip

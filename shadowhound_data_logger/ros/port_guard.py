@@ -71,10 +71,10 @@ def is_enabled() -> bool:
     return os.environ.get('SHADOWHOUND_PORT_GUARD', 'on').lower() not in {'off', '0', 'false', 'no'}
 
 
-def settle(folder: Path = FOLDER, *, is_done: bool = True) -> list[str]:
+def settle(folder: Path = FOLDER, *, dry_run: bool = False) -> list[str]:
     """Ports of this user that are marked as in use by a dead listener, or that were never finished.
 
-    Without ``is_done`` they are only listed. A listener is dead if the lock of its port can be acquired. If a publisher has
+    With ``dry_run`` they are only listed. A listener is dead if the lock of its port can be acquired. If a publisher has
     removed the lock's file, only a port that Fast DDS has flagged is settled: a live listener leaves such a port on its own and
     clears its mark, too.
     """
@@ -84,10 +84,10 @@ def settle(folder: Path = FOLDER, *, is_done: bool = True) -> list[str]:
         found = sorted(folder.iterdir())
     except OSError:
         return []
-    return [path.name for path in found if _PORT.fullmatch(path.name) and _settle(path, is_done=is_done)]
+    return [path.name for path in found if _PORT.fullmatch(path.name) and _settle(path, dry_run=dry_run)]
 
 
-def _settle(path: Path, *, is_done: bool) -> bool:
+def _settle(path: Path, *, dry_run: bool) -> bool:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:  # removed since, or no permission
@@ -99,7 +99,7 @@ def _settle(path: Path, *, is_done: bool) -> bool:
         data = os.pread(descriptor, file.st_size, 0)
         if _is_unfinished(data):
             is_left = time.time() - file.st_mtime >= MAKING_S
-            if is_left and is_done:
+            if is_left and not dry_run:
                 _give_up(descriptor, path, file.st_size)
             return is_left
         if not _busy_listeners(path.name, data, has_lock=True):
@@ -108,7 +108,7 @@ def _settle(path: Path, *, is_done: bool) -> bool:
             if has_lock is None:
                 return False
             found = _busy_listeners(path.name, os.pread(descriptor, file.st_size, 0), has_lock=has_lock)
-            for offset, flags in found if is_done else ():
+            for offset, flags in () if dry_run else found:
                 os.pwrite(descriptor, bytes((flags & ~PROCESSING | WAITING,)), offset)
             return bool(found)
     except OSError:

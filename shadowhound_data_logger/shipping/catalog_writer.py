@@ -132,13 +132,13 @@ class CatalogWriter:
         handed = frozenset[tuple[int, str]]().union(*self._told)
         new = [each for each in listed if (each[2].id, each[0]) not in handed]
         rows = [
-            (place, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata),
+            (index, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata),
                      'where': LOST if state == LOST else ON_ROBOT, 'reason': reason if state == LOST else None})
-            for place, (state, reason, item) in enumerate(new)
+            for index, (state, reason, item) in enumerate(new)
         ]  # fmt: skip
         made = []
         for robot, date, found in parts.by_folder(rows):
-            told = tuple((new[place][2].id, new[place][0]) for place, _ in found)
+            told = tuple((new[index][2].id, new[index][0]) for index, _ in found)
             part = self._part(robot, date, found, KEPT)
             made.append(replace(part, catalogs=(), reports=told))
             self._told.append(frozenset(told))

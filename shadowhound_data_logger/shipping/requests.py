@@ -381,9 +381,9 @@ def _in_turn(requests: Sequence[PullRequest]) -> list[PullRequest]:
     """The first of each requester, then the second of each, and so on: one who asks often does not come before all others."""
     turns = Counter[str]()
     order = []
-    for place, request in enumerate(requests):
+    for index, request in enumerate(requests):
         turns[request.by] += 1
-        order.append((turns[request.by], place, request))
+        order.append((turns[request.by], index, request))
     return [request for *_, request in sorted(order, key=itemgetter(0, 1))]
 
 

@@ -89,7 +89,7 @@ class Schedule:
     Thread-safe; ``_changed`` is the one lock over all of it. Times are seconds of the clock that is handed in.
     """
 
-    def __init__(self, threads: int, backoff_s: float, monotonic: Callable[[], float], rng: random.Random,
+    def __init__(self, threads: int, max_backoff_s: float, monotonic: Callable[[], float], rng: random.Random,
                  bytes_in: Callable[[float], float] = lambda _: float('inf')) -> None:  # fmt: skip
         self._threads = threads
         self._now = monotonic
@@ -100,8 +100,8 @@ class Schedule:
         self._stopped = False
         self._waiting_for: frozenset[str] = frozenset()
         self._ahead = Ahead()
-        self._breakers = Breakers(backoff_s, rng)
-        self._history = RetryQueue(backoff_s, rng)
+        self._breakers = Breakers(max_backoff_s, rng)
+        self._history = RetryQueue(max_backoff_s, rng)
         self._in_flight: dict[int, tuple[SpooledObject, int]] = {}  # by id; deliveries when it was claimed
         self._unsettled: set[int] = set()
         self._retries = 0

@@ -78,7 +78,7 @@ class Uploader:
         self._settle = settle
         self._monotonic = monotonic
         self._rng = rng or random.Random()
-        self._schedule = Schedule(settings.threads, settings.backoff_s, monotonic, self._rng, store.pace.bytes_in)
+        self._schedule = Schedule(settings.threads, settings.max_backoff_s, monotonic, self._rng, store.pace.bytes_in)
         reported: set[str] = set()
         self._threads = [Worker(f'upload-{n}', self._round, reported=reported) for n in range(settings.threads)]
         self._keeper = Worker('upload-lock', self._keep_lock, reported=reported)

@@ -48,7 +48,7 @@ class TopicRow:
     stored: int
     rejected: Mapping[str, int]
     dropped: Mapping[str, int]
-    last_kept: Times
+    last_stored: Times
     """Times of the newest durable sample; zeros if there is none."""
     estimated: int = 0
     """Messages in ``received`` without sequence numbers whose losses are estimated."""

@@ -69,7 +69,7 @@ class AccountTable(Table):
             'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
               _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected),
-              _json(fields_of(row.stamps)), *row.last_kept,
+              _json(fields_of(row.stamps)), *row.last_stored,
               row.first_ns, *row.newest, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         query = 'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?'
@@ -101,8 +101,8 @@ class AccountTable(Table):
     def topics(self, session: int | None = None, *, robot: str | None = None) -> list[TopicRow]:
         """The accounts of one session, those that a robot's next session continues, or all; in the order of the sessions."""
         where, values = ('WHERE session = ?', (session,)) if session is not None else _continued_by(robot)
-        columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, last_kept_received_ns, rejected, dropped,'
-                   ' ifnull(estimated, 0),'
+        columns = ('topic, type, accounting, received, skipped, stored, last_stored_ns, last_stored_received_ns, rejected,'
+                   ' dropped, ifnull(estimated, 0),'
                    " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, newest_ns, newest_received_ns, complete_ns, by_arrival,"
                    ' corrected, stamps')  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608

@@ -28,13 +28,13 @@ class Accounts:
     Thread-safe: one lock guards all of it. ``entry`` holds the lock; the other methods acquire it.
     """
 
-    def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, Times] | None = None,
+    def __init__(self, inherited: Iterable[PublisherRow] = (), last_stored: Mapping[str, Times] | None = None,
                  rhythms: Iterable[RhythmRow] = (), grades: Mapping[str, str] | None = None,
                  clock: Clock | None = None, newest: Mapping[str, Times] | None = None) -> None:  # fmt: skip
         """The arguments are those of earlier sessions, by account.
 
         ``grades`` are those of the newest messages: numbers do not show what was lost after messages without numbers. ``newest``
-        and ``last_kept`` are the times of the newest messages, and of the newest durable ones.
+        and ``last_stored`` are the times of the newest messages, and of the newest durable ones.
         """
         self._lock = threading.Lock()
         self._topics: dict[str, TopicAccount] = {}
@@ -53,7 +53,7 @@ class Accounts:
         self._clock = clock
         self._newest = dict(newest or {})
         self._unwritten: list[TopicGaps] = []
-        self._last_kept = dict(last_kept or {})
+        self._last_stored = dict(last_stored or {})
         for row in inherited:
             spans = self._inherited.setdefault(row.topic, {})
             spans[row.publisher] = Span(row.first, row.last, inherited=True, last_times=row.last_times, name=row.publisher)
@@ -103,7 +103,7 @@ class Accounts:
             for topic, (count, newest) in stored.items():
                 account = self._account(topic)
                 account.stored += count
-                account.last_kept = max(account.last_kept, newest)
+                account.last_stored = max(account.last_stored, newest)
 
     def drop_open(self, reason: str) -> int:
         """At shutdown: drop all messages without an outcome. Returns how many.
@@ -115,16 +115,16 @@ class Accounts:
             for topic, account in self._topics.items():
                 if account.open > 0 and not topic.startswith(SINKS):
                     lost += account.open
-                    since = account.last_kept if any(account.last_kept) else account.gaps.newest
+                    since = account.last_stored if any(account.last_stored) else account.gaps.newest
                     account.drop(reason, account.open, since, account.gaps.newest)
                     self._dirty = True
             return lost
 
-    def last_kept_ns(self, topic: str) -> int:
+    def last_stored_ns(self, topic: str) -> int:
         """Stamp of the topic's newest durable sample of any session; 0 if there is none."""
         with self._lock:
             account = self._topics.get(topic)
-            return max(account.last_kept if account else NO_TIMES, self._last_kept.get(topic, NO_TIMES)).stamp_ns
+            return max(account.last_stored if account else NO_TIMES, self._last_stored.get(topic, NO_TIMES)).stamp_ns
 
     def set_mission(self, mission_id: str) -> None:
         """Attribute losses from now on to this mission; '' for none."""
@@ -280,7 +280,7 @@ class CarriedMessages:
                     account.estimated += row.estimated
                     account.unknown += row.unknown
                 self._counts[row.topic] += row.received
-                self._times[row.topic] = row.last_kept if any(row.last_kept) else row.newest, row.newest
+                self._times[row.topic] = row.last_stored if any(row.last_stored) else row.newest, row.newest
 
     def recover(self, counts: Mapping[str, int], runs: Mapping[str, Sequence[NumberRun]],
                 newest: Mapping[str, Times] | None = None) -> None:  # fmt: skip

@@ -110,7 +110,7 @@ class Adoption:
         if row['sha256'] != sha256:
             self._foreign(path)
         elif row['state'] in _IN_SPOOL:
-            if path == ready or self._tree.place(path, ready):
+            if path == ready or self._tree.move(path, ready):
                 with self._index.transaction():
                     self._index.states.set_found(row['id'])
                 self._report.counts['missing files back'] += 1
@@ -202,6 +202,6 @@ def _counts(described: dict[str, Any]) -> dict[str, int]:
 
 def _more(row: TopicRow | None, topic: str, samples: int, item: DataObject) -> TopicRow:
     """The account with the samples of another file added."""
-    count, newest = (row.stored, row.last_kept) if row else (0, NO_TIMES)
+    count, newest = (row.stored, row.last_stored) if row else (0, NO_TIMES)
     count += samples
     return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest, item.last_times), unknown=count)

@@ -66,7 +66,7 @@ def _placed(index: Index, tree: Tree, before: Sequence[_Row]) -> list[SpooledObj
     pending = []
     for row in (row for old in before if (row := index.objects.full_row(old['id'])) is not None):
         if row['state'] == State.KEPT.value:
-            tree.place(tree.part(row['id']), tree.path(State.KEPT, None, row['bucket'], row['key']))
+            tree.move(tree.part(row['id']), tree.path(State.KEPT, None, row['bucket'], row['key']))
         elif row['state'] == State.PENDING.value:
             pending.append(spooled(row, tree.place_pending(row['id'], row['bucket'], row['key'])))
     return pending
@@ -113,7 +113,7 @@ def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
 def _to_part(tree: Tree, row: _Row) -> bool:
     """Move an object's file to its part; True also if the file is missing, which the uploader will report."""
     path = _own_path(tree, row)
-    return tree.place(path, tree.part(row['id'])) or tree.size(path) is None
+    return tree.move(path, tree.part(row['id'])) or tree.size(path) is None
 
 
 def _own_path(tree: Tree, row: _Row) -> Path:
@@ -135,7 +135,7 @@ def _put_back(tree: Tree, before: Sequence[_Row]) -> None:
     for row in before:
         with suppress(OSError):
             _describe(tree.part(row['id']), row)
-        tree.place(tree.part(row['id']), _own_path(tree, row))
+        tree.move(tree.part(row['id']), _own_path(tree, row))
 
 
 def _describe(path: Path, row: _Row) -> None:

@@ -100,7 +100,7 @@ class Tree:
         """Make the names of staged files and parts durable."""
         sync(self.incoming)
 
-    def place(self, source: Path, target: Path) -> bool:
+    def move(self, source: Path, target: Path) -> bool:
         """Rename a file, creating folders as needed; False if it is not at its target afterwards.
 
         Never raises OSError, because the row is committed: another process moved or removed the source, or the target cannot be
@@ -134,7 +134,7 @@ class Tree:
 
     def set_aside(self, path: Path) -> None:
         """Move a file that does not belong to the spool to ``foreign/``, without overwriting another."""
-        self.place(path, self._foreign(path))
+        self.move(path, self._foreign(path))
 
     def _foreign(self, path: Path) -> Path:
         target = wanted = self.root / 'foreign' / path.relative_to(self.root)
@@ -174,7 +174,7 @@ class Tree:
     def place_pending(self, number: int, bucket: str, key: str) -> Path:
         """The file of a pending object, renamed from its part if necessary; the part if that fails."""
         path, part = self.path(State.PENDING, None, bucket, key), self.part(number)
-        if not os.path.isfile(path) and not self.place(part, path) and os.path.exists(part):  # noqa: PTH110, PTH113 - these never raise
+        if not os.path.isfile(path) and not self.move(part, path) and os.path.exists(part):  # noqa: PTH110, PTH113 - these never raise
             return part
         return path
 

@@ -12,11 +12,11 @@ from typing import Any, Final, TypedDict
 from shadowhound_data_logger.core.dataclass_json import as_plain
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import State
-from shadowhound_data_logger.spool import act_record, clock_record
+from shadowhound_data_logger.spool import clock_record, operator_requests
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
-from shadowhound_data_logger.spool.act_record import Act
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.operator_requests import OperatorRequest
 from shadowhound_data_logger.spool.topic_account import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 
 STATES: Final = tuple(state.value for state in State)
@@ -91,7 +91,7 @@ class SpoolLedger(Ledger):
     """The ledger of a spool folder."""
 
     clock: ClockFigures
-    acts: list[Act]
+    operator_requests: list[OperatorRequest]
     """What operators requested."""
 
 
@@ -104,7 +104,7 @@ def read(spool: Path, robot: str) -> SpoolLedger:
         known = clock_record.read(spool, robot)
         clock = ClockFigures(is_set=known.is_set, steps=known.steps, last_step_s=known.last_step_s,
                              last_step_time=known.last_step_time, held=index.objects.held_count('clock'))  # fmt: skip
-        return {**of_index(index, robot), 'clock': clock, 'acts': act_record.read(spool, robot)}
+        return {**of_index(index, robot), 'clock': clock, 'operator_requests': operator_requests.read(spool, robot)}
 
 
 def journal(spool: Path, robot: str) -> list[Gap]:

@@ -111,4 +111,4 @@ def resend_gaps(root: Path) -> int:
 
 def _moved(tree: Tree, reason: str, bucket: str, key: str) -> bool:
     source, target = tree.path(State.QUARANTINED, reason, bucket, key), tree.path(State.PENDING, None, bucket, key)
-    return os.path.lexists(target) or tree.place(source, target)
+    return os.path.lexists(target) or tree.move(source, target)

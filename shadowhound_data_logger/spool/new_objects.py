@@ -92,7 +92,7 @@ class NewObjects:
     """The new objects of one commit: their rows and files.
 
     Lifecycle: new for each commit, under the spool's lock; ``stage`` before the transaction; ``add`` and ``take`` in it, and
-    ``discard`` if it is rolled back; ``place`` after it; ``close`` in any case. Nothing is written or synced inside the
+    ``discard`` if it is rolled back; ``name_files`` after it; ``close`` in any case. Nothing is written or synced inside the
     transaction, because other processes wait for it.
     """
 
@@ -119,8 +119,8 @@ class NewObjects:
         """
         expected = self._repeats.expected(objects)
         taken = [
-            item if (place in not_stored and not item.protected) or place in expected else self._staged(item)
-            for place, item in enumerate(objects)
+            item if (index in not_stored and not item.protected) or index in expected else self._staged(item)
+            for index, item in enumerate(objects)
         ]
         self._sync()
         return taken
@@ -169,14 +169,14 @@ class NewObjects:
         """Undo ``take`` before a rollback, because the same files may be committed again."""
         for number, path, _ in self._new_parts:
             if not path.exists():
-                self._tree.place(self._tree.part(number), path)
+                self._tree.move(self._tree.part(number), path)
 
     def close(self) -> None:
         """Remove files that were written but not taken, which would keep a full disk full."""
         for path in self._bodies:
             self._tree.remove(path)
 
-    def place(self) -> list[SpooledObject]:
+    def name_files(self) -> list[SpooledObject]:
         """After the commit: give the files their final names. Returns the objects that may be shipped."""
         self._repeats.keep()
         taken = {str(path) for _, path, _ in self._new_parts}
@@ -187,7 +187,7 @@ class NewObjects:
                 path = self._tree.place_pending(item.id, item.bucket, item.key)
                 pending.append(item if path == item.path else replace(item, path=path))
             elif state in {State.HELD, State.KEPT}:
-                self._tree.place(self._tree.part(item.id), item.path)
+                self._tree.move(self._tree.part(item.id), item.path)
         return pending
 
     def _staged(self, item: DataObject) -> DataObject:

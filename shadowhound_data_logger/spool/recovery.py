@@ -148,7 +148,7 @@ def _follow_rows(tree: Tree, sessions: SessionFiles, index: Index, now_ns: int, 
             continue
         path = where = tree.path(state, row['reason'], row['bucket'], row['key'])
         if state is State.KEPT and tree.size(tree.part(row['id'])) == row['bytes']:  # thinned, but not renamed yet
-            report.counts['renames completed'] += tree.place(tree.part(row['id']), path)
+            report.counts['renames completed'] += tree.move(tree.part(row['id']), path)
         if tree.size(path) is None:
             # Check its own place again last: another process may have just moved it there.
             ready, kept = (tree.path(of, None, row['bucket'], row['key']) for of in (State.PENDING, State.KEPT))
@@ -163,7 +163,7 @@ def _follow_rows(tree: Tree, sessions: SessionFiles, index: Index, now_ns: int, 
                 with index.transaction():
                     index.states.set_found(row['id'])
                 report.counts['quarantined files to be tried again'] += 1
-            elif found != path and tree.place(found, path):
+            elif found != path and tree.move(found, path):
                 where = path
                 renew(index, row['id'], path)  # a part may have the description of its former or its new state
                 report.counts['renames completed'] += 1
@@ -174,7 +174,7 @@ def _follow_rows(tree: Tree, sessions: SessionFiles, index: Index, now_ns: int, 
             report.counts['files missing'] += index.states.set_missing(missing, now_ns)
             index.states.move([row['id'] for row, _ in damaged], State.QUARANTINED, DAMAGED, now_ns)
     for row, where in damaged:
-        tree.place(where, tree.path(State.QUARANTINED, DAMAGED, row['bucket'], row['key']))
+        tree.move(where, tree.path(State.QUARANTINED, DAMAGED, row['bucket'], row['key']))
         report.counts['files damaged'] += 1
 
 
@@ -209,7 +209,7 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
                 _remove_unthinned(tree, index, number, part, report)
                 continue
             place = recorded_place(tree, part) if adopt else None
-            if place is None or not tree.place(part, place):
+            if place is None or not tree.move(part, place):
                 tree.remove(part)
                 report.counts['uncommitted parts removed'] += 1
 
@@ -238,7 +238,7 @@ def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -
         report.counts['messages lost with an open batch'] += row.open
         if row.open > 0:
             gaps = TopicGaps()
-            gaps.add(DROPPED, 'restart', row.open, row.last_kept if any(row.last_kept) else row.newest, row.newest)
+            gaps.add(DROPPED, 'restart', row.open, row.last_stored if any(row.last_stored) else row.newest, row.newest)
             lost += gaps.settle(row.topic, {(DROPPED, 'restart', EXACT): row.open})[0]
     with index.transaction():
         index.accounts.write(session, AccountSnapshot(tuple(rows), (), gaps=tuple(lost)))

@@ -63,11 +63,11 @@ class Repeats:
         """Indexes of objects that look like repeats, whose content need not be written."""
         last = {source: each.sha256 for source, each in self._next.items()}
         found = set[int]()
-        for place, item in enumerate(items):
+        for index, item in enumerate(items):
             if item.dedup and not item.held:
                 sha256 = content_sha256(item.body)
                 if last.get(_source(item)) == sha256:
-                    found.add(place)
+                    found.add(index)
                 last[_source(item)] = sha256
         return frozenset(found)
 

@@ -7,7 +7,7 @@ This module decides how much is evicted and when; ``ObjectTable.evictable`` has 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from sqlite3 import Row
@@ -56,30 +56,32 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, keep: KeepSetti
     are always stored, and nothing is evicted unless that makes enough room. ``leaving`` bytes are about to be freed. The caller
     holds the spool's lock and is not in a transaction: each round of evictions is a separate one.
     """
-    kept = [place for place, item in enumerate(objects) if item.is_on_request and not item.held]
+    kept = [position for position, item in enumerate(objects) if item.is_on_request and not item.held]
     needed = sum(map(_cost, objects))
     on_disk = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
     if not kept and (needed <= leaving or _excess(index, tree, settings, needed - leaving, on_disk) <= 0):
         return RoomMade()
     unkept = _make_room_to_keep(index, tree, settings, keep, objects, kept, leaving, now_ns)
-    kept_bytes = sum(_cost(objects[place]) for place in kept if place not in unkept)
-    rest = [place for place in range(len(objects)) if place not in kept]
-    needed = sum(_cost(objects[place]) for place in rest)
-    on_disk -= sum(len(objects[place].body) for place in unkept if isinstance(objects[place].body, FileBody))
+    kept_bytes = sum(_cost(objects[position]) for position in kept if position not in unkept)
+    rest = [position for position in range(len(objects)) if position not in kept]
+    needed = sum(_cost(objects[position]) for position in rest)
+    on_disk -= sum(len(objects[position].body) for position in unkept if isinstance(objects[position].body, FileBody))
     if not rest or (excess := _excess(index, tree, settings, needed - leaving, on_disk - kept_bytes)) <= 0:
         return RoomMade(frozenset(unkept), 0, len(unkept))
     free, evictable = needed - excess, index.objects.evictable_bytes()
     taken, not_stored = 0, set[int]()
-    for place in sorted(rest, key=lambda place: (not objects[place].protected, objects[place].priority, -place)):
-        item = objects[place]
+    for position in sorted(rest, key=lambda position: (not objects[position].protected, objects[position].priority, -position)):
+        item = objects[position]
         room = free + sum(size for priority, size in evictable.items() if priority >= item.priority)
         if item.protected or taken + _cost(item) <= room:
             taken += _cost(item)
         else:
-            not_stored.add(place)
+            not_stored.add(position)
     evicted = 0
     if taken and taken - free <= sum(evictable.values()):
-        evicted = _evict(index, tree, settings, taken - leaving, on_disk - kept_bytes, now_ns)
+        needed = taken - leaving
+        evicted = _evict(index, tree, index.objects.evictable,
+                         lambda: (_excess(index, tree, settings, needed, on_disk - kept_bytes), NO_ROOM), now_ns)  # fmt: skip
     return RoomMade(frozenset(not_stored | unkept), evicted, len(unkept))
 
 
@@ -88,28 +90,23 @@ def _make_room_to_keep(index: Index, tree: Tree, settings: SpoolSettings, keep: 
     """Evict kept objects, oldest first, for ``keep.max_bytes`` and for a full disk; returns the indexes of those not kept."""
     needed = sum(map(_cost, objects))
     on_disk = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
-    new_bytes = sum(len(objects[place].body) for place in kept)
+    new_bytes = sum(len(objects[position].body) for position in kept)
 
     def excess() -> tuple[int, int]:
         """Bytes too many on the disk, and beyond ``keep.max_bytes``."""
         on_full_disk = settings.min_free_bytes + needed - leaving - tree.free_bytes() - on_disk
         return on_full_disk, index.kept.bytes() + new_bytes - keep.max_bytes if kept else 0
 
-    while max(by := excess()) > 0 and (rows := index.kept.evictable(EVICTION_STEP)):
-        left, count = max(by), 0
-        while count < len(rows) and left > 0:
-            left -= rows[count]['bytes']
-            count += 1
-        _remove(index, tree, rows[:count], NO_ROOM if by[0] > 0 else KEEP_LIMIT, now_ns)
+    _evict(index, tree, index.kept.evictable, lambda: (max(by := excess()), NO_ROOM if by[0] > 0 else KEEP_LIMIT), now_ns)
     by_disk, by_limit = excess()
     unkept = set[int]()
-    for place in kept:
+    for position in kept:
         if max(by_disk, by_limit) <= 0:
             break
-        if not objects[place].protected:
-            unkept.add(place)
-            by_disk -= _cost(objects[place])
-            by_limit -= len(objects[place].body)
+        if not objects[position].protected:
+            unkept.add(position)
+            by_disk -= _cost(objects[position])
+            by_limit -= len(objects[position].body)
     return unkept
 
 
@@ -146,15 +143,17 @@ def is_short(tree: Tree, settings: SpoolSettings, objects: Sequence[DataObject])
     return tree.free_bytes() < sum(map(_cost, objects)) + max(BALLAST_BYTES, settings.min_free_bytes)
 
 
-def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, on_disk: int, now_ns: int) -> int:
-    """Evict objects, by priority and age, until ``needed`` bytes fit; returns how many objects."""
+def _evict(index: Index, tree: Tree, next_rows: Callable[[int], Sequence[Row]], excess: Callable[[], tuple[int, str]],
+           now_ns: int) -> int:  # fmt: skip
+    """Evict the next objects until ``excess`` (bytes too many, and the reason) is gone; returns how many objects."""
     evicted = 0
-    while (excess := _excess(index, tree, settings, needed, on_disk)) > 0 and (rows := index.objects.evictable(EVICTION_STEP)):
+    while (bytes_and_reason := excess())[0] > 0 and (rows := next_rows(EVICTION_STEP)):
+        left, reason = bytes_and_reason
         count = 0
-        while count < len(rows) and excess > 0:
-            excess -= rows[count]['bytes']
+        while count < len(rows) and left > 0:
+            left -= rows[count]['bytes']
             count += 1
-        _remove(index, tree, rows[:count], NO_ROOM, now_ns)
+        _remove(index, tree, rows[:count], reason, now_ns)
         evicted += count
     return evicted
 

@@ -175,8 +175,8 @@ CREATE TABLE accounts (
   by_arrival TEXT NOT NULL,     -- JSON: messages dated by arrival, by the reason why their own time was not trusted
   corrected TEXT NOT NULL,      -- JSON: messages stored after a correction, by fault
   stamps TEXT NOT NULL,         -- JSON: what was unusual about its publishers' stamps (core/stamps.py, StampReport); '{}' if nothing
-  last_kept_ns INTEGER NOT NULL,          -- of the newest durable sample: its stamp ...
-  last_kept_received_ns INTEGER NOT NULL, -- ... and when it arrived
+  last_stored_ns INTEGER NOT NULL,          -- of the newest durable sample: its stamp ...
+  last_stored_received_ns INTEGER NOT NULL, -- ... and when it arrived
   first_ns INTEGER NOT NULL,
   newest_ns INTEGER NOT NULL,             -- of the newest message: the same two
   newest_received_ns INTEGER NOT NULL,

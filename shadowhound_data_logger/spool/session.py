@@ -100,7 +100,7 @@ def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
                 moved[row.topic] = replace(
                     before, type=row.type, accounting=row.accounting, received=before.received + row.open,
                     estimated=before.estimated + estimated, unknown=before.unknown + unknown,
-                    last_kept=max(before.last_kept, row.last_kept), newest=max(before.newest, row.newest),
+                    last_stored=max(before.last_stored, row.last_stored), newest=max(before.newest, row.newest),
                 )  # fmt: skip
                 index.accounts.take_over(number, row.topic, row.open, estimated, unknown)
     index.accounts.write(session, AccountSnapshot(tuple(moved.values()), ()))

@@ -301,9 +301,9 @@ class Spool:
             try:
                 staged_objects = new.stage(objects, room.not_stored)
                 with self._connections.writing.transaction(undo=new.discard):
-                    for place, item in enumerate(staged_objects):
+                    for number, item in enumerate(staged_objects):
                         if self._takes(item):
-                            new.add(item, fits=place not in room.not_stored)
+                            new.add(item, fits=number not in room.not_stored)
                     for outcome in outcomes:
                         self._connections.writing.states.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                     for each in rows:
@@ -316,7 +316,7 @@ class Spool:
                 self.accounts.mark_dirty()
                 raise
             self.accounts.store(stored)
-            return new.place()
+            return new.name_files()
 
     def _takes(self, item: DataObject) -> bool:
         """Whether an object of bookkeeping is still needed: its answer is the next one, its rows are in no other part yet."""
@@ -334,7 +334,7 @@ class Spool:
             with flock(self.root / 'recovery.lock', wait=False) as mine, self._connections.lock:
                 if mine and self._connections.writing.objects.state(item.id) is State.QUARANTINED:
                     source = self._tree.place_pending(item.id, item.bucket, item.key)
-                    self._tree.place(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
+                    self._tree.move(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
         except (OSError, sqlite3.Error) as error:
             log.warning('cannot move %s to the quarantine: %s', item.path, error)
 
@@ -355,8 +355,8 @@ def _continued(index: Index, robot: str, clock: Clock) -> Accounts:
     grades: dict[str, str] = {}
     newest: dict[str, Times] = {}
     for account in index.accounts.topics(robot=robot):
-        kept[account.topic] = max(kept.get(account.topic, NO_TIMES), account.last_kept)
-        known = (account.newest, account.last_kept, newest.get(account.topic, NO_TIMES))
+        kept[account.topic] = max(kept.get(account.topic, NO_TIMES), account.last_stored)
+        known = (account.newest, account.last_stored, newest.get(account.topic, NO_TIMES))
         newest[account.topic] = next((each for each in known if any(each)), NO_TIMES)
         if account.received:
             grades[account.topic] = account.accounting

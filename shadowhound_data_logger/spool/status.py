@@ -212,7 +212,7 @@ def _faults(node: NodeStatus) -> Iterator[str]:
     yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store.blocked_buckets.items())
     yield from (f'{name} fails: {worker.last_error}' for name, worker in node.workers.items() if worker.failing)
     yield from (f'{name}: {text}' for name, text in node.stalls.items())
-    yield from (row.text for row in (node.middleware.unheard or {}).values())
+    yield from (row.text for row in (node.middleware.undiscovered or {}).values())
 
 
 def _losses(topics: Mapping[str, TopicStatus]) -> Iterator[str]:

@@ -89,5 +89,5 @@ def thin(index: Index, tree: Tree, session: int, item: ThinnableObject, thinned:
             tree.sync_incoming()
     finally:
         tree.remove(body)
-    tree.place(tree.part(item.id), tree.path(State.KEPT, None, row['bucket'], row['key']))
+    tree.move(tree.part(item.id), tree.path(State.KEPT, None, row['bucket'], row['key']))
     return replace(item, samples=thinned.samples, bytes=size, sha256=sha256, step=2 * item.step)

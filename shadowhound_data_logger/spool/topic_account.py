@@ -101,7 +101,7 @@ class TopicAccount:
     estimated_missed: Counter[str] = field(default_factory=Counter)
     """Estimated losses by cause."""
     estimate: TopicEstimate = field(default_factory=TopicEstimate)
-    last_kept: Times = NO_TIMES
+    last_stored: Times = NO_TIMES
     """Times of the newest durable sample: after a restart, sampling continues after it."""
     other_types: dict[str, OtherTypeAccount] = field(default_factory=dict)
     former: dict[str, tuple[int, int]] = field(default_factory=dict)
@@ -310,7 +310,7 @@ class TopicAccount:
             self.complete_ns = min(max(self.complete_ns, settled_ns), latest_ns)
         return TopicRow(
             topic, self.type, self.accounting, self.received, self.skipped, self.stored + count,
-            dict(self.rejected), dict(self.dropped), max(self.last_kept, newest),
+            dict(self.rejected), dict(self.dropped), max(self.last_stored, newest),
             self.estimated, self.unknown, dict(+self.estimated_missed), self.first_ns,
             last._replace(stamp_ns=newest_ns), self.complete_ns, dict(self.by_arrival),
             dict(self.corrected), self.stamps,

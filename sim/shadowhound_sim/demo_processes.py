@@ -143,7 +143,7 @@ def environment(home: Path, tower: Mapping[str, str], domain: int) -> dict[str, 
 
 def start_logger(folder: Path, environ: Mapping[str, str], *, arm: str = '') -> Child:
     """The node, once its spool can be read; its bag has the topics of an arm too. Raises DemoFailed if it does not start."""
-    settings: tuple[str, ...] = (f'shutdown.drain_s:={DRAIN_S}', f'upload.backoff_s:={BACKOFF_S}', 'bag.record:=mission')
+    settings: tuple[str, ...] = (f'shutdown.drain_s:={DRAIN_S}', f'upload.max_backoff_s:={BACKOFF_S}', 'bag.record:=mission')
     settings += (f'bag.regex:=^/({arm}/.*|camera/compressed|odom|joint_states)$',) if arm else ()
     arguments = ['--ros-args', *(word for each in settings for word in ('-p', each))]
     node = Child('shadowhound_data_logger.node.sensor_logger_node', arguments, environ, folder / 'node.log')

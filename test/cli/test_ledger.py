@@ -50,7 +50,7 @@ def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
     named = {f'/{name}'.replace('__', '/'): row for name, row in topics.items()}
     return {
         'robot': 'thor', 'balanced': balanced, 'topics': named, 'bags': {}, 'events': {}, 'objects': counts, 'bytes': counts,
-        'clock': {'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 0}, 'acts': [],
+        'clock': {'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 0}, 'operator_requests': [],
         'not_logged': {}, 'robots': ['thor'],
     }  # fmt: skip
 

@@ -44,7 +44,7 @@ def a_status(**changes: Any) -> dict[str, Any]:
     """As the node writes it; a mapping among the changes is laid over the one that is there."""
     found: dict[str, Any] = {
         'robot': 'thor', 'version': '0.1.0', 'pid': 12345, 'boot_id': 'b', 'boot_ns': 0, 'time': '2026-11-21T06:39:05.123Z',
-        'uptime_s': 7412.3, 'paused': False, 'ended': False, 'middleware': {'unheard': None},
+        'uptime_s': 7412.3, 'paused': False, 'ended': False, 'middleware': {'undiscovered': None},
         'topics': {'/camera/camera_info': a_topic(received=1_234_567), '/imu': a_topic()},
         'queue': {'batches': 1, 'messages': 12_345, 'bytes': 1_234_567, 'max_messages': 50_000, 'max_bytes': 67_108_864},
         'spool': {'path': '/home/go2/.shadowhound/spool', 'pending': 3, 'held': 0, 'quarantined': 0, 'bytes': 123_456_789,
@@ -384,8 +384,8 @@ def test_watch_restores_the_terminal(tmp_path: Path) -> None:
 def test_a_topic_that_others_hear_is_not_called_silent() -> None:
     """Somebody publishes it, as the finding says."""
     row = a_topic(publishers=0, received=0)
-    unheard = {'/imu': {'text': '/imu is not all heard'}}
-    text = shown(topics={'/imu': row}, middleware={'unheard': unheard}, findings=['/imu is not all heard'])
+    undiscovered = {'/imu': {'text': '/imu is not all heard'}}
+    text = shown(topics={'/imu': row}, middleware={'undiscovered': undiscovered}, findings=['/imu is not all heard'])
     assert '/imu is not all heard' in text
     assert 'Nobody publishes' not in text
     assert 'Nobody publishes /imu' in shown(topics={'/imu': row})

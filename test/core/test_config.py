@@ -95,7 +95,7 @@ def test_an_invalid_robot_name_names_its_variable() -> None:
     ('camera.bucket', '../x', 'letters'),
     ('camera.key', '{robot}/front.jpg', '{date} and {time}'), ('camera.priority', 10, '0 to 9'),
     ('spool.max_bytes', 5, 'at least'),
-    ('spool.max_bytes', 1e10, 'a whole number'), ('upload.backoff_s', 0.0, '0.1 to 3600'), ('upload.threads', 0, '1 to 64'),
+    ('spool.max_bytes', 1e10, 'a whole number'), ('upload.max_backoff_s', 0.0, '0.1 to 3600'), ('upload.threads', 0, '1 to 64'),
     ('shutdown.drain_s', float('inf'), '0 to 600'), ('sensors', 'camera', 'a list of names'),
     ('sensors', ['a', 'a'], 'each once'),
 ])  # fmt: skip

@@ -19,14 +19,14 @@ from shadowhound_data_logger.core.status import (
     TopicStatus,
     Totals,
     Trigger,
-    UnheardTopic,
+    UndiscoveredTopic,
     WorkerStatus,
 )
 
 FULL = NodeStatus(
     robot='thor',
     mission=MissionStatus('patrol_1', None, 'patrol', '2026-11-21T06:36:05Z'),
-    middleware=MiddlewareStatus(unheard={'/odom': UnheardTopic(1, ('/go2_driver',), 40, 'text')}),
+    middleware=MiddlewareStatus(undiscovered={'/odom': UndiscoveredTopic(1, ('/go2_driver',), 40, 'text')}),
     bag=BagStatus(recording=True, topics={'/imu': Totals(received=3)}),
     events=EventStatus(enabled=True, last=Trigger('fall', 'page', '2026-11-21T06:36:05Z', 'event_fall')),
     topics={

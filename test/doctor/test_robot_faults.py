@@ -210,9 +210,9 @@ def beside(**middleware: object) -> dict[str, object]:
     return {'rmw': 'rmw_fastrtps_cpp', 'robot': 'rmw_cyclonedds_cpp', **middleware}
 
 
-def unheard(scene: Scene) -> None:
+def undiscovered(scene: Scene) -> None:
     rows = {'/imu': {'publishers': 2, 'nodes': ['/go2_driver'], 'seconds': 41, 'text': '/imu is not all heard'}}
-    scene.run_node(middleware=beside(unheard=rows), workers={'front': {}})
+    scene.run_node(middleware=beside(undiscovered=rows), workers={'front': {}})
 
 
 def endpoint_of_the_node(scene: Scene) -> None:
@@ -279,7 +279,8 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'a port that a killed process has left': (unfinished_port, 'sockets', 'sockets.ports', ('--fix', 'then continues')),
     'node not running': (not_running, 'spool', 'node.running', ('sensor_logger_node',)),
     'node that is paused': (lambda scene: scene.run_node(paused=True), 'spool', 'node.status', ('/pause ', '{data: false}')),
-    'publishers that the node does not hear': (unheard, 'spool', 'node.unheard', ('capture.rmw: robot', 'CYCLONEDDS_URI')),
+    'publishers that the node does not hear': (
+        undiscovered, 'spool', 'node.undiscovered', ('capture.rmw: robot', 'CYCLONEDDS_URI')),
     'a front that fails': (failing_front, 'spool', 'node.front', ('journalctl', 'shadowhound-data node')),
     'no front': (lambda scene: scene.run_node(middleware=beside()), 'spool', 'node.front', ('rmw-cyclonedds-cpp',)),
     'node that does not deliver': (no_delivery, 'spool', 'node.delivery', ('doctor --only s3',)),

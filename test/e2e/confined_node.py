@@ -9,13 +9,13 @@ from dataclasses import replace
 
 from e2e.machines import inside
 
-from shadowhound_data_logger.node.intake import unheard
+from shadowhound_data_logger.node.intake import undiscovered
 from shadowhound_data_logger.node.intake.middleware import RMW, choose
 
 pid, interface, *arguments = sys.argv[1:]
 if pid != 'inside':
     os.execvp('nsenter', [*inside(int(pid)), sys.executable, __file__, 'inside', interface, *arguments])  # noqa: S606
-unheard.SETTLED_S = 2.0  # type: ignore[misc]
+undiscovered.SETTLED_S = 2.0  # type: ignore[misc]
 general = f'<General><Interfaces><NetworkInterface name="{interface}"/></Interfaces></General>'
 uri = f'<CycloneDDS><Domain>{general}</Domain></CycloneDDS>'
 robot = dict(os.environ)

@@ -21,7 +21,7 @@ TOPIC = '/talk'
 COUNT = 20
 TALK = {
     'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.1,
-    'upload.backoff_s': 0.2, 'upload.read_timeout_s': 1.0,
+    'upload.max_backoff_s': 0.2, 'upload.read_timeout_s': 1.0,
 }  # fmt: skip
 
 

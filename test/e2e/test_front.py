@@ -195,12 +195,12 @@ def test_the_front_publishes_the_nodes_state(nodes: dict[str, Node], stations: d
 def test_whom_the_robot_finds_is_compared_by_a_front_alone(nodes: dict[str, Node]) -> None:
     """A node that listens through the RMW of the robot compares nothing, and says that it does not."""
 
-    def unheard(space: str) -> Any:
+    def undiscovered(space: str) -> Any:
         node = nodes[space]
-        return read(node.home / 'spool', node.robot, SystemClock.of_this_machine()).node.middleware.unheard
+        return read(node.home / 'spool', node.robot, SystemClock.of_this_machine()).node.middleware.undiscovered
 
-    until(lambda: unheard(BESIDE) == {}, 'the front has reported, and all is heard')
-    assert unheard(DIRECT) is None
+    until(lambda: undiscovered(BESIDE) == {}, 'the front has reported, and all is heard')
+    assert undiscovered(DIRECT) is None
     with closing(connect(nodes[DIRECT].home / 'spool')) as connection:
         assert not connection.ask('compare', found={})['ok']
 

@@ -31,7 +31,7 @@ from shadowhound_data_logger.stores.s3 import S3Store
 
 BUCKET: Final = 'bad-days'
 FOREIGN: Final = b'of another writer'
-UPLOAD: Final = UploadSettings(threads=3, connect_timeout_s=0.5, read_timeout_s=0.3, backoff_s=0.05)
+UPLOAD: Final = UploadSettings(threads=3, connect_timeout_s=0.5, read_timeout_s=0.3, max_backoff_s=0.05)
 COMMIT_S: Final = 0.02
 DEADLINE_S: Final = 60.0
 SIZES: Final = (0, 100, 700, 2000)

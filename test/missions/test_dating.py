@@ -10,13 +10,12 @@ from clocks import NOON_NS, Clocks
 from missions.fakes import FakePictures, FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
-from shadowhound_data_logger.core.dating import Dating
+from shadowhound_data_logger.core.clock_watch import UtcOffsets
 from shadowhound_data_logger.missions.active import ActiveMission, MissionFinder, ended
-from shadowhound_data_logger.missions.dating import NO_DATE, assign_date
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.missions.odometer import Pose
-from shadowhound_data_logger.missions.overview import overview, report
+from shadowhound_data_logger.missions.overview import NO_DATE, overview, report
 from shadowhound_data_logger.missions.replay import Replay
 
 MS = 1_000_000
@@ -63,9 +62,9 @@ def test_a_mission_takes_as_long_as_it_does(tmp_path: Path, clocks: Clocks, step
 
 
 def sender(home: Path, clocks: Clocks, tracking: FakeTracking, spooler: FakeSpooler, **offsets: int) -> Replay:
-    dating = Dating(clocks, 600.0, lambda: {name.replace('_', '-'): offset for name, offset in offsets.items()})
+    recorded = UtcOffsets(clocks, 600.0, lambda: {name.replace('_', '-'): offset for name, offset in offsets.items()})
     return Replay(
-        home, tracking, spooler, FakePictures(), settle=lambda folder: assign_date(folder, dating), rng=random.Random(1)
+        home, tracking, spooler, FakePictures(), settle=lambda folder: folder.assign_date(recorded), rng=random.Random(1)
     )  # type: ignore[arg-type]
 
 

@@ -12,7 +12,7 @@ NOON_NS = 1_760_788_800 * SECOND
 
 
 def kept(gate: FirstOfPeriod, *stamps_ns: int) -> list[int]:
-    return [stamp for stamp in stamps_ns if gate.keep(stamp, b'')]
+    return [stamp for stamp in stamps_ns if gate.selects(stamp, b'')]
 
 
 def test_the_first_message_of_each_second_is_kept() -> None:
@@ -51,38 +51,38 @@ def test_a_message_is_kept_when_its_content_changes(*, has_header: bool) -> None
     """The stamp of a header is not content; where there is no header those bytes are."""
     gate = OnChange(has_header=has_header)
     cdr = b'\x00\x01\x00\x00' + b'STAMPSTA' + b'content'
-    assert gate.keep(0, cdr)
-    assert not gate.keep(0, cdr)
-    assert gate.keep(0, cdr.replace(b'STAMP', b'stamp')) is not has_header
-    assert gate.keep(0, cdr.replace(b'content', b'changed'))
-    assert gate.keep(0, cdr), 'what comes back is a change as well'
+    assert gate.selects(0, cdr)
+    assert not gate.selects(0, cdr)
+    assert gate.selects(0, cdr.replace(b'STAMP', b'stamp')) is not has_header
+    assert gate.selects(0, cdr.replace(b'content', b'changed'))
+    assert gate.selects(0, cdr), 'what comes back is a change as well'
 
 
 def test_a_latched_message_is_kept_once() -> None:
     """What is sent again to a node that was restarted has the stamp of the newest durable sample; another content is new."""
-    gate = OnChange(has_header=False, last_kept_ns=7 * SECOND)
-    assert [gate.keep(stamp * SECOND, content) for stamp, content in ((7, b'0000a'), (8, b'0000a'), (9, b'0000b'))] == [
+    gate = OnChange(has_header=False, last_stored_ns=7 * SECOND)
+    assert [gate.selects(stamp * SECOND, content) for stamp, content in ((7, b'0000a'), (8, b'0000a'), (9, b'0000b'))] == [
         False, False, True,
     ]  # fmt: skip
-    assert OnChange(has_header=False, last_kept_ns=7 * SECOND).keep(8 * SECOND, b'0000a')
+    assert OnChange(has_header=False, last_stored_ns=7 * SECOND).selects(8 * SECOND, b'0000a')
 
 
 def test_the_settings_choose_the_gate() -> None:
     """0 Hz keeps every message, on_change goes before the rate."""
 
     def gate(**settings: object) -> object:
-        return rule_for(SensorSettings(name='x', **settings), has_header=True, last_kept_ns=0)  # type: ignore[arg-type]
+        return rule_for(SensorSettings(name='x', **settings), has_header=True, last_stored_ns=0)  # type: ignore[arg-type]
 
     assert isinstance(gate(rate_hz=0.0), EveryMessage)
     assert isinstance(gate(rate_hz=2.0), FirstOfPeriod)
     assert isinstance(gate(rate_hz=2.0, on_change=True), OnChange)
-    assert EveryMessage().keep(0, b'')
+    assert EveryMessage().selects(0, b'')
 
 
 def test_the_rate_is_the_period() -> None:
     """At 4 Hz four messages a second are kept."""
-    gate = rule_for(SensorSettings(name='x', rate_hz=4.0), has_header=True, last_kept_ns=0)
-    assert sum(gate.keep(NOON_NS + number * SECOND // 100, b'') for number in range(300)) == 12
+    gate = rule_for(SensorSettings(name='x', rate_hz=4.0), has_header=True, last_stored_ns=0)
+    assert sum(gate.selects(NOON_NS + number * SECOND // 100, b'') for number in range(300)) == 12
 
 
 def test_a_clock_that_is_set_does_not_stop_the_sampling() -> None:

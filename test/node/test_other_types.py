@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.status import OtherType, Totals
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake import subscriber as module
 from shadowhound_data_logger.node.intake.sampling import Sampler
-from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscriber, SubscriberContext
+from shadowhound_data_logger.node.intake.subscriber import Dependencies, OtherTypes, Subscriber
 from shadowhound_data_logger.ros import endpoints
 from shadowhound_data_logger.ros.endpoints import Endpoint
 from shadowhound_data_logger.ros.reader import FAST_DDS, PolledGroup
@@ -63,7 +63,7 @@ class Listening(Participant):
         sensor = SensorSettings(name='sensor', topics=topics, types=types, rate_hz=0.0, batch_s=3600.0)
         types_here = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         stamps = StampRule(SystemClock.of_this_machine())
-        around = SubscriberContext(self.node, PolledGroup(), self.accounts, types_here, stamps)
+        around = Dependencies(self.node, PolledGroup(), self.accounts, types_here, stamps)
         self.sampler = Sampler({sensor.name: sensor}, self.accounts, types_here, self.batches)
         self.source = Subscriber(around, sensor, [self.sampler], self.others)
 

@@ -68,7 +68,7 @@ def test_a_dead_listener_waits_from_now_on(shm: Path, name: str, mutex: int, fla
     """It is one byte that changes, once, and only when it is asked for; on both machines, of both names."""
     path = leave(shm, flags, name=name, mutex=mutex)
     before = path.read_bytes()
-    assert settle(shm, is_done=False) == [name]
+    assert settle(shm, dry_run=True) == [name]
     assert path.read_bytes() == before
     assert settle(shm) == [name]
     assert first(path, mutex) == SETTLED
@@ -142,7 +142,7 @@ def test_an_unfinished_port_is_abandoned(shm: Path, data: bytes, told: bytes) ->
     assert settle(shm) == [], 'it may be in the making'
     os.utime(path, (time.time() - 2 * MAKING_S,) * 2)
     with path.open('rb') as waiting:
-        assert settle(shm, is_done=False) == [PORT]
+        assert settle(shm, dry_run=True) == [PORT]
         assert settle(shm) == [PORT]
         assert waiting.read()[:4] == told
     assert not path.exists()
@@ -166,7 +166,7 @@ def test_an_operator_can_turn_it_off(monkeypatch: pytest.MonkeyPatch, shm: Path)
         context.setattr(subprocess, 'Popen', None)
         PortGuard().close()
     monkeypatch.delenv('SHADOWHOUND_PORT_GUARD')
-    assert settle(shm, is_done=False) == [PORT]
+    assert settle(shm, dry_run=True) == [PORT]
 
 
 def until(condition: Callable[[], bool], what: str) -> None:

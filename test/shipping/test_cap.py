@@ -79,7 +79,7 @@ def server() -> Iterator[FakeS3]:
 
 
 def started(spool: FakeSpool, server: FakeS3, max_mbps: float) -> tuple[Uploader, S3Store]:
-    settings = UploadSettings(threads=3, backoff_s=0.1, max_mbps=max_mbps)
+    settings = UploadSettings(threads=3, max_backoff_s=0.1, max_mbps=max_mbps)
     store = S3Store(StoreSettings(endpoint_url=server.url, access_key_id='a', secret_access_key='b'), settings)
     store.open()
     spool.uploader = Uploader(spool, store, settings, spool.settle)

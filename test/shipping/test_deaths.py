@@ -35,7 +35,7 @@ def start(spool: FakeSpool) -> Iterator[Callable[[MemoryStore], Uploader]]:
     opened: list[Uploader] = []
 
     def start(store: MemoryStore) -> Uploader:
-        spool.uploader = Uploader(spool, store, UploadSettings(threads=3, backoff_s=0.1), spool.settle, rng=random.Random(5))
+        spool.uploader = Uploader(spool, store, UploadSettings(threads=3, max_backoff_s=0.1), spool.settle, rng=random.Random(5))
         opened.append(spool.uploader)
         spool.uploader.open()
         return spool.uploader

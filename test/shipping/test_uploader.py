@@ -27,7 +27,7 @@ from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
-SETTINGS = UploadSettings(threads=3, backoff_s=0.1)
+SETTINGS = UploadSettings(threads=3, max_backoff_s=0.1)
 Start = Callable[..., Uploader]
 
 

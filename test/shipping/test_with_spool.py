@@ -15,7 +15,7 @@ from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 
-SETTINGS = UploadSettings(threads=3, backoff_s=0.1)
+SETTINGS = UploadSettings(threads=3, max_backoff_s=0.1)
 
 
 def data_object(number: int, bucket: str = 'sensor-data', priority: int = 5, size: int = 20) -> DataObject:

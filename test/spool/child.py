@@ -92,7 +92,7 @@ def die(root: Path, moment: str) -> None:
     put(spool, make('thor/whole.jpg', b'whole'))
     if moment == 'checkpointed':
         spool._connections.writing._db.execute('PRAGMA wal_checkpoint(PASSIVE)')
-    step = 'sync_incoming' if moment == 'uncommitted' else 'place'
+    step = 'sync_incoming' if moment == 'uncommitted' else 'move'
     setattr(Tree, step, lambda *_: os.kill(os.getpid(), signal.SIGKILL))
     put(spool, make('thor/a.jpg', b'a'), make('thor/b.jpg', b'b', held='clock'))
 

@@ -384,7 +384,7 @@ def test_open_is_what_has_no_outcome() -> None:
     accounts.store({'/odom': (3, by_arrival(77))})
     with accounts.entry('/odom') as account:
         assert account.open == 1
-    assert accounts.last_kept_ns('/odom') == 77
+    assert accounts.last_stored_ns('/odom') == 77
 
 
 def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
@@ -394,7 +394,7 @@ def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
         account.receive('p', 5)
     snapshot = accounts.snapshot({'/odom': (1, by_arrival(9))})
     assert snapshot is not None
-    assert (snapshot.topics[0].stored, snapshot.topics[0].open, snapshot.topics[0].last_kept.stamp_ns) == (1, 0, 9)
+    assert (snapshot.topics[0].stored, snapshot.topics[0].open, snapshot.topics[0].last_stored.stamp_ns) == (1, 0, 9)
     assert snapshot.publishers == (PublisherRow('/odom', 'p', 5, 5, 1, 1, {}),)
     accounts.store({'/odom': (1, by_arrival(9))})
     assert accounts.snapshot({}) is None
@@ -409,13 +409,13 @@ def test_samples_of_an_unreceived_topic_are_detected() -> None:
     assert [(row.topic, row.open) for row in snapshot.topics] == [('/ghost', -2)]
 
 
-def test_the_last_kept_stamp_is_inherited() -> None:
+def test_the_last_stored_stamp_is_inherited() -> None:
     """A restarted node goes on sampling after the newest durable sample of any session."""
-    accounts = Accounts(last_kept={'/odom': by_arrival(50)})
-    assert accounts.last_kept_ns('/odom') == 50
+    accounts = Accounts(last_stored={'/odom': by_arrival(50)})
+    assert accounts.last_stored_ns('/odom') == 50
     accounts.store({'/odom': (1, by_arrival(40))})
-    assert accounts.last_kept_ns('/odom') == 50
-    assert accounts.last_kept_ns('/imu') == 0
+    assert accounts.last_stored_ns('/odom') == 50
+    assert accounts.last_stored_ns('/imu') == 0
 
 
 def test_messages_of_another_type_are_received_and_rejected(opened: Open, root: Path) -> None:

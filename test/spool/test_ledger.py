@@ -85,7 +85,7 @@ def test_a_complete_ledger(spool: Spool, root: Path) -> None:
             'spooled': 9, 'delivered': 5, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 3, 'deduplicated': 0, 'kept': 0,
         },
         'clock': {'is_set': None, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 1},
-        'acts': [],
+        'operator_requests': [],
     }  # fmt: skip
     assert json.loads(json.dumps(ledger.read(root, 'thor'))) == ledger.read(root, 'thor')
 

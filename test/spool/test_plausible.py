@@ -35,7 +35,7 @@ def test_what_is_ours_is_not_doubted(index: Path) -> None:
 @pytest.mark.parametrize(
     'change',
     [
-        "accounts SET last_kept_ns = 'x'", 'accounts SET received = -1', "publishers SET last = x'00'",
+        "accounts SET last_stored_ns = 'x'", 'accounts SET received = -1', "publishers SET last = x'00'",
         "objects SET metadata = 'x'",
         "objects SET key = '../../etc/passwd' WHERE id = 3", "objects SET key = '/etc/passwd' WHERE id = 3",
         "objects SET reason = '../x' WHERE id = 2", "objects SET bucket = '..' WHERE id = 3", 'objects SET bytes = 1 << 60',

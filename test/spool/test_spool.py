@@ -216,7 +216,7 @@ def test_sequence_numbers_continue_after_a_stop(opened: Open, root: Path) -> Non
     spool = opened()
     with spool.accounts.entry('/camera') as account:
         account.receive('p', 5)
-    assert spool.accounts.last_kept_ns('/camera') == NOON_NS
+    assert spool.accounts.last_stored_ns('/camera') == NOON_NS
     spool.commit([make()])
     topic = assert_whole(root)['topics']['/camera']
     assert (topic['published'], topic['received'], topic['missed_by']) == (5, 2, {'restart': 3})

@@ -66,7 +66,7 @@ COLUMNS: Final[Mapping[str, str]] = {
 Times are in microseconds, because Spark cannot read TIMESTAMP(NANOS); the ``_ns`` columns have the exact times.
 ``x y yaw`` are meters and radians (REP-103) in the frame ``pose_frame``, the map or that of the odometry, and ``latitude
 longitude altitude`` are degrees and meters (WGS 84), at the object's time: ``t_start`` of a single message, the middle of a
-batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date: ``t_start`` and ``t_end``
+batch. ``clock`` is how well the times are known (unsynced_objects.py). With ``unset`` there is no date: ``t_start`` and ``t_end``
 are null, the ns count from the robot's boot, and the file is below ``date=1970-01-01``. With ``set_later``, ``clock_offset_ns``
 must be added to the times in the content. ``received_*`` is when the messages arrived; ``by_arrival`` is the number of messages
 dated by their arrival because their stamps were not trusted.

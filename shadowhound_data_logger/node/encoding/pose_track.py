@@ -21,7 +21,7 @@ from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.formats.records import FIX, ODOMETRY, TRANSFORMS
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.missions.odometer import Pose
-from shadowhound_data_logger.node.encoding.kept_messages import KeptMessages
+from shadowhound_data_logger.node.encoding.message_track import MessageTrack
 from shadowhound_data_logger.node.encoding.transforms import TransformTrack
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
 from shadowhound_data_logger.node.recording.mission_observer import Source, Sources, battery_pct, yaw_of
@@ -72,9 +72,9 @@ class RobotTrack(Consumer):
         self._odometry = Sources(settings.odometry, resolve)
         self._battery = Sources(settings.battery, resolve)
         self._transforms = TransformTrack(types, robot)
-        self._poses: list[tuple[Source, KeptMessages]] = []
-        self._charges: list[tuple[Source, KeptMessages]] = []
-        self._fixes: list[tuple[Source, KeptMessages]] = []
+        self._poses: list[tuple[Source, MessageTrack]] = []
+        self._charges: list[tuple[Source, MessageTrack]] = []
+        self._fixes: list[tuple[Source, MessageTrack]] = []
         """The preferred source first. Replaced atomically."""
 
     def has_pose(self, sensor: SensorSettings) -> bool:
@@ -91,7 +91,7 @@ class RobotTrack(Consumer):
             for message in drained.messages:
                 kept.add(message.stamp_ns, message.cdr)
 
-    def of(self, topic: str, type_name: str) -> KeptMessages | None:
+    def of(self, topic: str, type_name: str) -> MessageTrack | None:
         """The kept messages of a topic; None if they are not needed."""
         if type_name == ODOMETRY and (source := self._odometry.find(topic, type_name)) is not None:
             self._poses, kept = _added(self._poses, source, POSE_EVERY_NS, type_name, self._pose)
@@ -170,8 +170,8 @@ class RobotTrack(Consumer):
             return None
 
 
-def _added(known: list[tuple[Source, KeptMessages]], source: Source, every_ns: int, type_name: str,
-           read: Callable[[str, bytes], object]) -> tuple[list[tuple[Source, KeptMessages]], KeptMessages | None]:  # fmt: skip
+def _added(known: list[tuple[Source, MessageTrack]], source: Source, every_ns: int, type_name: str,
+           read: Callable[[str, bytes], object]) -> tuple[list[tuple[Source, MessageTrack]], MessageTrack | None]:  # fmt: skip
     """Add the messages of a source; a topic whose type changed starts again. None if there are too many topics."""
     for of, kept in known:
         if of.topic == source.topic and kept.type == type_name:
@@ -179,7 +179,7 @@ def _added(known: list[tuple[Source, KeptMessages]], source: Source, every_ns: i
     others = [each for each in known if each[0].topic != source.topic]
     if len(others) >= MAX_TOPICS:
         return known, None
-    made = KeptMessages(every_ns, type_name, read)
+    made = MessageTrack(every_ns, type_name, read)
     return sorted([*others, (source, made)], key=lambda each: each[0][:2]), made
 
 

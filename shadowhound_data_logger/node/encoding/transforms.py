@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.formats.records import TRANSFORMS
 from shadowhound_data_logger.formats.types import MessageTypes
-from shadowhound_data_logger.node.encoding.kept_messages import SPAN_NS, KeptMessages
+from shadowhound_data_logger.node.encoding.message_track import SPAN_NS, MessageTrack
 
 EVERY_NS: Final = SECOND // 10
 BASES: Final = ('base_link', 'base_footprint', 'body')
@@ -65,7 +65,7 @@ Frames = Mapping[str, Transform]
 class _Set:
     """Messages of one publisher with the same frames."""
 
-    messages: KeptMessages
+    messages: MessageTrack
     is_static: bool
     frames: frozenset[str] | None = None
     """None until the first message was read."""
@@ -92,7 +92,7 @@ class TransformTrack:
                          if one.is_static or message.stamp_ns - one.messages.newest_ns < SPAN_NS}  # fmt: skip
             if len(known) >= MAX_KEPT:
                 return
-            found = _Set(KeptMessages(EVERY_NS, TRANSFORMS, self._read), topic.endswith('_static'))
+            found = _Set(MessageTrack(EVERY_NS, TRANSFORMS, self._read), topic.endswith('_static'))
             self._sets = {**known, key: found}
         found.messages.add(message.stamp_ns, message.cdr)
 

@@ -10,7 +10,7 @@ from typing import Final
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.node.intake.consumers import Consumer
-from shadowhound_data_logger.node.intake.subscriber import Subscriber, SubscriberContext
+from shadowhound_data_logger.node.intake.subscriber import Dependencies, Subscriber
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class ExtraTopics:
     New; ``refresh`` while it listens, ``end`` afterwards.
     """
 
-    def __init__(self, shared: SubscriberContext, consumers: Sequence[Consumer], types: Mapping[str, str]) -> None:
+    def __init__(self, shared: Dependencies, consumers: Sequence[Consumer], types: Mapping[str, str]) -> None:
         """The first of ``consumers`` is the consumer; topics subscribed to here are also passed to the others.
 
         ``types`` are those that sensors name for topics, also for topics that they do not use at present.

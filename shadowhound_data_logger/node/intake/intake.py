@@ -24,7 +24,7 @@ from shadowhound_data_logger.node.intake.consumers import Consumer
 from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
 from shadowhound_data_logger.node.intake.found_topics import FoundTopics
-from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscriber, SubscriberContext, SubscriberStatus
+from shadowhound_data_logger.node.intake.subscriber import Dependencies, OtherTypes, Subscriber, SubscriberStatus
 from shadowhound_data_logger.ros.endpoints import POLL_S, alternatives
 from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -56,7 +56,7 @@ class Intake:
         self._consumers = consumers
         self._found = found
         self._early = early
-        self._context = context = SubscriberContext(node, early.group if early else PolledGroup(), accounts, types, stamps, early)
+        self._context = context = Dependencies(node, early.group if early else PolledGroup(), accounts, types, stamps, early)
         self._others = OtherTypes(node, accounts)
         self._subscribers = tuple(Subscriber(context, sensor, consumers, self._others) for sensor in sensors.values())
         self._is_first = first

@@ -1,7 +1,7 @@
 """Selects messages of the sensors' topics and groups them into batches: the first decision after the take.
 
-Plain Python, owned by the intake thread. A rule keeps or skips a message, a ``Batcher`` collects the messages of one object, and
-the ``Sampler`` does both for each sensor and passes the batches to the encoders.
+Plain Python, owned by the intake thread. A rule selects or skips messages, a ``Batcher`` collects those of one object, and the
+``Sampler`` does both for each sensor and passes the batches to the encoders.
 """
 
 from __future__ import annotations
@@ -45,32 +45,32 @@ GRACE_S: Final = 2 * POLL_S
 """How late the last message of a window may arrive."""
 
 
-class KeepRule(Protocol):
-    """Decides which messages are kept, one at a time, in order of arrival."""
+class SamplingRule(Protocol):
+    """Decides which messages are stored, one at a time, in order of arrival."""
 
-    def keep(self, stamp_ns: int, cdr: bytes) -> bool:
+    def selects(self, stamp_ns: int, cdr: bytes) -> bool:
         """Whether this message is stored."""
 
 
 class EveryMessage:
-    """Keeps every message."""
+    """Selects every message."""
 
-    def keep(self, stamp_ns: int, cdr: bytes) -> bool:  # noqa: ARG002 - the Protocol's arguments
+    def selects(self, stamp_ns: int, cdr: bytes) -> bool:  # noqa: ARG002 - the Protocol's arguments
         return True
 
 
 class FirstOfPeriod:
-    """Keeps the first message of each whole period of UTC, so that a key with the period is unique.
+    """Selects the first message of each whole period of UTC, so that a key with the period is unique.
 
-    ``last_kept_ns`` is the stamp of the newest durable sample: after a restart within a period nothing is kept twice.
+    ``last_stored_ns`` is the stamp of the newest durable sample: after a restart within a period nothing is kept twice.
     """
 
-    def __init__(self, period_ns: int, last_kept_ns: int = 0) -> None:
+    def __init__(self, period_ns: int, last_stored_ns: int = 0) -> None:
         self._period_ns = period_ns
         self._steps_back = max(2, STEP_BACK_NS // period_ns)
-        self._last = last_kept_ns // period_ns if last_kept_ns else -1
+        self._last = last_stored_ns // period_ns if last_stored_ns else -1
 
-    def keep(self, stamp_ns: int, cdr: bytes) -> bool:  # noqa: ARG002 - the Protocol's arguments
+    def selects(self, stamp_ns: int, cdr: bytes) -> bool:  # noqa: ARG002 - the Protocol's arguments
         period = stamp_ns // self._period_ns
         if self._last - self._steps_back <= period <= self._last:
             return False
@@ -79,30 +79,30 @@ class FirstOfPeriod:
 
 
 class OnChange:
-    """Keeps a message whose content, except for its header's stamp, differs from the last one kept.
+    """Selects a message whose content, except for its header's stamp, differs from the last one selected.
 
-    ``last_kept_ns`` is the stamp of the newest durable sample: a first message with this stamp is the same one, delivered
+    ``last_stored_ns`` is the stamp of the newest durable sample: a first message with this stamp is the same one, delivered
     again, as latched messages are.
     """
 
-    def __init__(self, *, has_header: bool, last_kept_ns: int = 0) -> None:
+    def __init__(self, *, has_header: bool, last_stored_ns: int = 0) -> None:
         self._start = STAMP_END if has_header else 4
         self._last: int | None = None
-        self._last_kept_ns = last_kept_ns
+        self._last_stored_ns = last_stored_ns
 
-    def keep(self, stamp_ns: int, cdr: bytes) -> bool:
+    def selects(self, stamp_ns: int, cdr: bytes) -> bool:
         content = crc32(memoryview(cdr)[self._start :])
-        changed = content != self._last and not (self._last is None and 0 < stamp_ns == self._last_kept_ns)
+        changed = content != self._last and not (self._last is None and 0 < stamp_ns == self._last_stored_ns)
         self._last = content
         return changed
 
 
-def rule_for(sensor: SensorSettings, *, has_header: bool, last_kept_ns: int) -> KeepRule:
+def rule_for(sensor: SensorSettings, *, has_header: bool, last_stored_ns: int) -> SamplingRule:
     """The rule of a sensor's settings."""
     if sensor.on_change:
-        return OnChange(has_header=has_header, last_kept_ns=last_kept_ns)
+        return OnChange(has_header=has_header, last_stored_ns=last_stored_ns)
     if sensor.rate_hz:
-        return FirstOfPeriod(round(SECOND / sensor.rate_hz), last_kept_ns)
+        return FirstOfPeriod(round(SECOND / sensor.rate_hz), last_stored_ns)
     return EveryMessage()
 
 
@@ -171,7 +171,7 @@ class Sampler(Consumer):
         self._types = types
         self._queue = queue
         self._sampled: dict[str, _Sampled] = {}
-        self._kept_ns: dict[str, int] = {}
+        self._chosen_ns: dict[str, int] = {}
         self.idle = False
         """Whether the data is not needed at present: messages are counted and skipped."""
 
@@ -180,35 +180,35 @@ class Sampler(Consumer):
         self.idle = idle
 
     def enter(self, topic: str, type_name: str, sensor: str) -> None:
-        kept_ns = self._kept_ns.get(topic) or self._accounts.last_kept_ns(topic)
-        self._sampled[topic] = _Sampled(self._sensors[sensor], topic, type_name, self._types.has_header(type_name), kept_ns)
+        chosen_ns = self._chosen_ns.get(topic) or self._accounts.last_stored_ns(topic)
+        self._sampled[topic] = _Sampled(self._sensors[sensor], topic, type_name, self._types.has_header(type_name), chosen_ns)
 
     def choose(self, drained: Drained, account: TopicAccount) -> None:
         messages = drained.messages
         sampled = self._sampled[drained.topic]
         try:
-            kept = self._kept(sampled, drained)
+            chosen = self._select(sampled, drained)
         except Exception:
             account.drop(SAMPLER_FAILED, len(messages), messages[0].times, messages[-1].times)
             raise
-        sampled.chosen = kept
-        if kept:
-            sampled.kept_ns = kept[-1][1].stamp_ns
-            sampled.open_ns = sampled.open_ns or kept[0][1].stamp_ns
+        sampled.chosen = chosen
+        if chosen:
+            sampled.chosen_ns = chosen[-1][1].stamp_ns
+            sampled.open_ns = sampled.open_ns or chosen[0][1].stamp_ns
         if drained.paused:
             received = account.gaps.newest
             account.drop(PAUSED, len(messages), received if any(received) else messages[0].times, messages[-1].times)
         else:
-            account.skipped += len(messages) - len(kept)
+            account.skipped += len(messages) - len(chosen)
 
-    def _kept(self, sampled: _Sampled, drained: Drained) -> list[_Chosen]:
+    def _select(self, sampled: _Sampled, drained: Drained) -> list[_Chosen]:
         sampled.follow(self._sensors[drained.sensor])
-        kept: list[_Chosen] = []
+        chosen: list[_Chosen] = []
         if not (drained.paused or self.idle):
             for cdr, _, publisher, _, received_ns, stamp_ns, clock, untrusted_ns in drained.messages:
-                if sampled.of(clock).rule.keep(stamp_ns, cdr):
-                    kept.append((clock, Sample(stamp_ns, cdr, received_ns, publisher, untrusted_ns)))
-        return kept
+                if sampled.of(clock).rule.selects(stamp_ns, cdr):
+                    chosen.append((clock, Sample(stamp_ns, cdr, received_ns, publisher, untrusted_ns)))
+        return chosen
 
     def take(self, drained: Drained) -> None:
         sampled = self._sampled[drained.topic]
@@ -221,7 +221,7 @@ class Sampler(Consumer):
     def leave(self, topic: str) -> None:
         sampled = self._sampled.pop(topic, None)
         if sampled is not None:
-            self._kept_ns[topic] = sampled.kept_ns
+            self._chosen_ns[topic] = sampled.chosen_ns
             self._close(sampled)
 
     def tick(self, now_s: float) -> None:
@@ -243,7 +243,7 @@ class Sampler(Consumer):
             sampled.open_ns = sampled.first_open_ns()
 
     def oldest_open(self) -> dict[str, int]:
-        """Topic -> the first stamp of its kept messages that are not encoded yet; from any thread."""
+        """Topic -> the first stamp of its selected messages that are not encoded yet; from any thread."""
         # A batch moves from here to the queue, so this order misses none.
         found = {topic: sampled.open_ns for topic, sampled in list(self._sampled.items()) if sampled.open_ns}
         for topic, first_ns in self._queue.oldest().items():
@@ -258,19 +258,19 @@ class Sampler(Consumer):
 
 
 _Chosen = tuple[str | None, Sample]
-"""A kept message, and the clock that it follows (``Taken.clock``)."""
+"""A selected message, and the clock that it follows (``Taken.clock``)."""
 
 
 class _Sampled:
     """One topic and type of a sensor. Each clock that its publishers follow has a separate rule and batch."""
 
-    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, has_header: bool, kept_ns: int) -> None:
-        self.kept_ns = kept_ns
-        """Stamp of the newest kept message: no period is stored twice."""
+    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, has_header: bool, chosen_ns: int) -> None:
+        self.chosen_ns = chosen_ns
+        """Stamp of the newest selected message: no period is stored twice."""
         self.open_ns = 0
-        """Stamp of the first kept message that is not in the queue yet; 0 if there is none."""
+        """Stamp of the first selected message that is not in the queue yet; 0 if there is none."""
         self.chosen: Sequence[_Chosen] = ()
-        """Messages kept from the current drain."""
+        """Messages selected from the current drain."""
         self._topic, self._type, self._has_header = topic, type_name, has_header
         self._clocks: dict[str | None, _Sampling] = {}
         self._sensor = sensor
@@ -289,7 +289,7 @@ class _Sampled:
         return found
 
     def add(self, clock: str | None, sample: Sample, now_s: float) -> list[Batch]:
-        """Add a kept sample; returns the batches that it closes."""
+        """Add a selected sample; returns the batches that it closes."""
         batcher = self.of(clock).batcher
         closed = batcher.add(sample, now_s)
         if len(self._clocks) > 1 and sum(each.batcher.size for each in self._clocks.values()) >= batcher.max_bytes:
@@ -312,15 +312,15 @@ class _Sampled:
                 each.rule = self._rule(sensor)
         self._sensor = sensor
 
-    def _rule(self, sensor: SensorSettings) -> KeepRule:
-        return rule_for(sensor, has_header=self._has_header, last_kept_ns=self.kept_ns)
+    def _rule(self, sensor: SensorSettings) -> SamplingRule:
+        return rule_for(sensor, has_header=self._has_header, last_stored_ns=self.chosen_ns)
 
 
 @dataclass(slots=True)
 class _Sampling:
     """The rule and batcher for one clock."""
 
-    rule: KeepRule
+    rule: SamplingRule
     batcher: Batcher
 
 

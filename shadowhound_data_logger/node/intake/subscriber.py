@@ -157,8 +157,8 @@ class OtherTypes:
         return self._node
 
 
-class SubscriberContext(NamedTuple):
-    """What all subscribers of an intake share."""
+class Dependencies(NamedTuple):
+    """What subscribers need, the same for all of an intake."""
 
     node: Node
     group: PolledGroup
@@ -172,7 +172,7 @@ class SubscriberContext(NamedTuple):
 class Subscriber:
     """Subscribes to a topic, of a sensor or not: ``refresh`` follows the graph, ``drain`` takes messages."""
 
-    def __init__(self, shared: SubscriberContext, sensor: SensorSettings, consumers: Sequence[Consumer],
+    def __init__(self, shared: Dependencies, sensor: SensorSettings, consumers: Sequence[Consumer],
                  others: OtherTypes | None = None) -> None:  # fmt: skip
         """Messages are passed to ``consumers``.
 

@@ -65,13 +65,13 @@ class EventBuffer:
     Lifecycle: New; open once; ``close`` after the intake.
     """
 
-    def __init__(self, node: Node, settings: Settings, place: BagContext, recovery: BagRecovery,
+    def __init__(self, node: Node, settings: Settings, context: BagContext, recovery: BagRecovery,
                  types: MessageTypes) -> None:  # fmt: skip
         options, home = settings.events, settings.home
         ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
-        self.events = Events(options, settings.bag, place, ring, recovery, POLL_S)
+        self.events = Events(options, settings.bag, context, ring, recovery, POLL_S)
         self.consumer = EventConsumer(node, options, ring, self.events.claims) if options.enabled else None
-        self._watch = self._make_watch(options, home, place, types)
+        self._watch = self._make_watch(options, home, context, types)
 
     @property
     def consumers(self) -> Sequence[EventConsumer]:
@@ -106,7 +106,7 @@ class EventBuffer:
         if self._watch is not None:
             self._watch.on_mission(mission)
 
-    def _make_watch(self, options: EventSettings, home: Path, place: BagContext, types: MessageTypes) -> EventWatch | None:
+    def _make_watch(self, options: EventSettings, home: Path, context: BagContext, types: MessageTypes) -> EventWatch | None:
         if self.consumer is None:
             return None
-        return EventWatch(self.consumer.inbox, types, home, place.clock, options.log_event, self.events.trigger)
+        return EventWatch(self.consumer.inbox, types, home, context.clock, options.log_event, self.events.trigger)

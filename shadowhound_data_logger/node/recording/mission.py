@@ -14,13 +14,12 @@ from functools import partial
 from typing import Final
 
 from shadowhound_data_logger.core import metadata_keys as meta
-from shadowhound_data_logger.core.clock import SECOND, iso
+from shadowhound_data_logger.core.clock import SECOND, iso, now_ns
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import Batch, DataObject
 from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.active import THIS_MACHINE, ActiveMission, MissionFinder, ended
-from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
 from shadowhound_data_logger.node.intake.intake import Intake

@@ -17,14 +17,13 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.recorder import Answer
-from shadowhound_data_logger.core.clock import SECOND, Clock
+from shadowhound_data_logger.core.clock import SECOND, Clock, now_ns
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.expression import Condition
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder
 from shadowhound_data_logger.node.recording.mission_observer import number_at
 

@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.mailbox import RequestRefused
 from shadowhound_data_logger.node.reporting.diagnostics import plain_entries
 from shadowhound_data_logger.node.reporting.status import Stages, Status
-from shadowhound_data_logger.spool.act_record import ActRecord
+from shadowhound_data_logger.spool.operator_requests import OperatorRequests
 
 log = logging.getLogger(__name__)
 
@@ -64,13 +64,13 @@ class Commands:
     """
 
     def __init__(
-        self, stages: Stages, parameters: ParameterAccess, status: Status, acts: ActRecord, robot: str, node: str
+        self, stages: Stages, parameters: ParameterAccess, status: Status, requests: OperatorRequests, robot: str, node: str
     ) -> None:
-        """``acts`` records requests with a named requester; ``node`` is the logger's full public name in ROS."""
+        """``requests`` records requests with a named requester; ``node`` is the logger's full public name in ROS."""
         self._stages = stages
         self._parameters = parameters
         self._status = status
-        self._acts = acts
+        self._requests = requests
         self._robot = robot
         self._node = node
         recorder = stages.recorder
@@ -108,7 +108,7 @@ class Commands:
         if isinstance(done, dict):
             return {'ok': True, 'robot': self._robot, **done}
         if who := _who(request):
-            self._acts.add(who, printable(str(request.get('do')))[:MAX_NAME], ok=done[0], said=done[1])
+            self._requests.add(who, printable(str(request.get('do')))[:MAX_NAME], ok=done[0], answer=done[1])
         return {'ok': done[0], 'robot': self._robot, 'message' if done[0] else 'error': done[1]}
 
     def _do(self, request: Mapping[str, Any]) -> Answer | dict[str, Any]:
@@ -217,8 +217,12 @@ class Commands:
 
     def _compare(self, found: Mapping[str, Any] | None = None) -> Answer | dict[str, Any]:
         """For the front: publishers that the robot's RMW finds and ours does not."""
-        unheard = self._stages.unheard
-        return unheard.compare(found or {}) if unheard is not None else (False, 'the node listens through the RMW of the robot')
+        publishers = self._stages.undiscovered
+        return (
+            publishers.compare(found or {})
+            if publishers is not None
+            else (False, 'the node listens through the RMW of the robot')
+        )
 
 
 _KINDS: Final[Mapping[type, str]] = {str: 'a string', float: 'a number with a point', list: 'a list', dict: 'an object'}

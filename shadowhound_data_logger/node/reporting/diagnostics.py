@@ -46,14 +46,14 @@ def entries(status: NodeStatus, earlier: NodeStatus) -> Iterator[Entry]:
     """All entries of a status."""
     stalls = status.stalls
     yield _node(status)
-    unheard = status.middleware.unheard or {}
+    undiscovered = status.middleware.undiscovered or {}
     for topic, row in status.topics.items():
         level, text = _topic(row, earlier.topics.get(topic, row), stalls.get(topic, ''))
-        if topic in unheard:
-            level, text = ERROR, unheard[topic].text
+        if topic in undiscovered:
+            level, text = ERROR, undiscovered[topic].text
         yield topic, level, text, fields_of(row)
-    for topic in unheard.keys() - status.topics.keys():
-        yield topic, ERROR, unheard[topic].text, {'publishers': unheard[topic].publishers}
+    for topic in undiscovered.keys() - status.topics.keys():
+        yield topic, ERROR, undiscovered[topic].text, {'publishers': undiscovered[topic].publishers}
     yield _bag(status.bag, earlier.bag)
     yield _events(status.events, earlier.events)
     yield _spool(status.spool, earlier.spool)

@@ -29,7 +29,7 @@ from shadowhound_data_logger.core.config import NOT_SETTINGS
 from shadowhound_data_logger.core.errors import DataLoggerError, NodeUnavailable
 from shadowhound_data_logger.core.ros_arguments import NODE
 from shadowhound_data_logger.core.worker import Worker
-from shadowhound_data_logger.node.intake.unheard import MAX_PUBLISHERS
+from shadowhound_data_logger.node.intake.undiscovered import MAX_PUBLISHERS
 from shadowhound_data_logger.node.parameters import Described, declare, parameter, plain
 from shadowhound_data_logger.node.reporting.interface import Interface
 from shadowhound_data_logger.ros.reader import endpoints

@@ -38,7 +38,7 @@ from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, Encode
 from shadowhound_data_logger.node.intake.intake import Intake
 from shadowhound_data_logger.node.intake.middleware import Middleware
 from shadowhound_data_logger.node.intake.subscriber import SubscriberStatus
-from shadowhound_data_logger.node.intake.unheard import Unheard
+from shadowhound_data_logger.node.intake.undiscovered import UndiscoveredPublishers
 from shadowhound_data_logger.node.keeping.upload_rules import UploadRules
 from shadowhound_data_logger.node.recording.bags import BagConsumer
 from shadowhound_data_logger.node.recording.events import EventBuffer
@@ -80,7 +80,7 @@ class Stages:
     control: ControlSocket
     middleware: Middleware
     front: Front | None = None
-    unheard: Unheard | None = None
+    undiscovered: UndiscoveredPublishers | None = None
     """None if the node uses the robot's RMW."""
     requests: RequestServer | None = None
     """None if no data is kept until requested."""
@@ -197,11 +197,11 @@ class Status:
 
     def _middleware(self, now_s: float) -> MiddlewareStatus:
         """Its sockets are queried less often: that takes a third of the time of the complete status."""
-        unheard = self._stages.unheard
+        undiscovered = self._stages.undiscovered
         if now_s >= self._sockets_due_s:
             self._sockets_due_s = now_s + SOCKETS_S
             self._sockets = self._stages.middleware.status()
-        return replace(self._sockets, unheard=unheard.rows() if unheard is not None else None)
+        return replace(self._sockets, undiscovered=undiscovered.rows() if undiscovered is not None else None)
 
     def _bag(self) -> BagStatus:
         """The recording, with this session's messages by topic."""

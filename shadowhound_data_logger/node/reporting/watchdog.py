@@ -45,7 +45,7 @@ EVEN: Final = 3.0
 """Maximum ratio of the longest to the usual pause for an even topic."""
 UNMATCHED_S: Final = 10.0
 """Discovery takes a second or two on a working WiFi."""
-UNHEARD_S: Final = 30.0
+UNRECEIVED_S: Final = 30.0
 
 
 class Watchdog:
@@ -170,7 +170,7 @@ class SilenceDetector:
         if row.unavailable:
             return f'it cannot be subscribed to here: {row.unavailable}'
         return (
-            self._unheard(row, now_s - self._since_s)
+            self._unreceived(row, now_s - self._since_s)
             if self._received_s is None
             else self._stopped(row, now_s - self._received_s)
         )
@@ -181,11 +181,11 @@ class SilenceDetector:
             self._pauses.append((received_s - self._received_s, received - self._received))
         self._received_s, self._received = received_s, received
 
-    def _unheard(self, row: TopicStatus, waited_s: float) -> str:
+    def _unreceived(self, row: TopicStatus, waited_s: float) -> str:
         if not row.matched and waited_s > UNMATCHED_S:
             hint = f'compare type and QoS (ros2 topic info -v {self._topic}), and the firewall between the two machines'
             return f'its publisher has been there for {waited_s:.0f} s without a connection to it; {hint}'
-        if row.matched and not row.may_be_silent and waited_s > UNHEARD_S:
+        if row.matched and not row.may_be_silent and waited_s > UNRECEIVED_S:
             hint = f'does it publish (ros2 topic hz {self._topic}), and do large messages pass the network?'
             return f'its publisher has been connected for {waited_s:.0f} s but no message was received; {hint}'
         return ''

@@ -24,7 +24,7 @@ from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake import extra_topics as module
 from shadowhound_data_logger.node.intake.consumers import TopicChoice
 from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
-from shadowhound_data_logger.node.intake.subscriber import SubscriberContext
+from shadowhound_data_logger.node.intake.subscriber import Dependencies
 from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
 
@@ -61,7 +61,7 @@ class Recording:
                                          leave=lambda _: None)  # fmt: skip
         self.group = PolledGroup()
         stamps = StampRule(SystemClock.of_this_machine())
-        around = SubscriberContext(node, self.group, Accounts(), MessageTypes(), stamps)
+        around = Dependencies(node, self.group, Accounts(), MessageTypes(), stamps)
         self.extra = ExtraTopics(around, [self.bags], {})
         self.now_s = time.monotonic()
 

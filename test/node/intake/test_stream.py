@@ -38,14 +38,14 @@ class Batches(list[Batch]):
 class Talk:
     """A stream of Strings that are sent every 100 ms, and the sampler that listens to it."""
 
-    def __init__(self, last_kept_ns: int = 0, **settings: float | str) -> None:
+    def __init__(self, last_stored_ns: int = 0, **settings: float | str) -> None:
         self.sensor = SensorSettings(name='talk', **{'rate_hz': 0.0, 'batch_s': 3600.0, **settings})  # type: ignore[arg-type]
         self.accounts = Accounts()
         self.batches = Batches()
         self.senders = Senders()
         self.numbers = count(1)
-        if last_kept_ns:
-            self.accounts.store({TOPIC: (0, by_arrival(last_kept_ns))})
+        if last_stored_ns:
+            self.accounts.store({TOPIC: (0, by_arrival(last_stored_ns))})
         self.sensors, types, self.stamps = {'talk': self.sensor}, MessageTypes(), StampRule(SystemClock.of_this_machine())
         queue: Any = self.batches
         self.sampler = Sampler(self.sensors, self.accounts, types, queue)
@@ -153,7 +153,7 @@ def test_another_rate_keeps_nothing_of_a_period_twice(rate_hz: float, kept: list
 
 def test_what_was_kept_before_the_stream_began_is_not_kept_again() -> None:
     """A stream that begins anew within a period (a sensor that is switched off and on) waits for the next one."""
-    talk = Talk(rate_hz=1.0, last_kept_ns=NOON_NS + 1)
+    talk = Talk(rate_hz=1.0, last_stored_ns=NOON_NS + 1)
     talk.add(talk.messages(12))
     assert talk.kept() == [10]
     talk.stream.close()

@@ -22,7 +22,7 @@ from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, Top
 from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
 from shadowhound_data_logger.node.intake.sampling import Sampler
 from shadowhound_data_logger.node.intake.stream import Senders, SensorStream, TopicStream
-from shadowhound_data_logger.node.intake.subscriber import SubscriberContext
+from shadowhound_data_logger.node.intake.subscriber import Dependencies
 from shadowhound_data_logger.node.recording.bags import BagConsumer
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.topic_account import BAG, TopicAccount
@@ -222,7 +222,7 @@ def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tup
     """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
     bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, wanted_topics=TopicChoice(BagSettings(), named))
     nothing: Any = None
-    extra = ExtraTopics(SubscriberContext(nothing, nothing, nothing, nothing, STAMPS), [bags], {})
+    extra = ExtraTopics(Dependencies(nothing, nothing, nothing, nothing, STAMPS), [bags], {})
     sensors = dict.fromkeys(('/imu', '/odom'), False)
     extra.refresh(sensors | {'/rosout': False}, sensors, 0.0, paused=False)
     assert bags.topics == expected

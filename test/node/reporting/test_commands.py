@@ -38,14 +38,14 @@ class Stages:
         self.earlier: Mapping[str, Any] | None = None
         self.version = '1'
         self.requests: Any = None
-        self.acts: list[tuple[str, str, bool, str]] = []
+        self.recorded: list[tuple[str, str, bool, str]] = []
 
     def commands(self) -> Commands:
         stages: Any = self
         return Commands(stages, Parameters(), stages, stages, 'thor', '/ns/sensor_logger_node')
 
-    def add(self, who: str, do: str, *, ok: bool, said: str) -> None:
-        self.acts.append((who, do, ok, said))
+    def add(self, who: str, do: str, *, ok: bool, answer: str) -> None:
+        self.recorded.append((who, do, ok, answer))
 
     def does(self, stage: str) -> bool:
         self.asked.append(stage)
@@ -286,11 +286,11 @@ def test_named_requests_are_recorded() -> None:
         commands.answer({'do': do, 'who': 'operator at 10.0.0.7'})
     ask(commands, 'resume')
     ask(commands, 'yield', max_mbps=1.0)
-    assert {who for who, *_ in stages.acts} == {'operator at 10.0.0.7'}
-    assert [(do, ok) for _, do, ok, _ in stages.acts] == [
+    assert {who for who, *_ in stages.recorded} == {'operator at 10.0.0.7'}
+    assert [(do, ok) for _, do, ok, _ in stages.recorded] == [
         ('bag start', True), ('bag stop', False), ('bag split', False), ('event', True), ('nothing', False),
     ]  # fmt: skip
-    assert stages.acts[1][3] == 'nothing is recorded'
+    assert stages.recorded[1][3] == 'nothing is recorded'
 
 
 def test_the_requester_is_logged(caplog: pytest.LogCaptureFixture) -> None:

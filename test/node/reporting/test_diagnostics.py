@@ -25,7 +25,7 @@ STATUS: dict[str, Any] = {
     'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
     'events': {'enabled': True, 'seconds': 30.0, 'bytes': 10, 'max_bytes': 100, 'bag': '', 'refused': '', 'triggers': 1,
                'written': 1, 'last': {'name': 'fall', 'by': 'log_event'}, 'topics': {'/imu': {'dropped': 2}}},
-    'middleware': {'unheard': None},
+    'middleware': {'undiscovered': None},
     'bag': {'recording': True, 'paused': False, 'bag': 'patrol_1', 'dropped': 3, 'refused': '', 'topics': {}},
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'max_messages': 10, 'max_bytes': 100},
     'spool': {'path': '/s', 'pending': 3, 'held': 0, 'quarantined': 1, 'evicted': 2, 'bytes': 10, 'max_bytes': 100,
@@ -63,11 +63,11 @@ def told(name: str, **values: Any) -> tuple[Any, str]:
 
 def test_publishers_that_are_not_heard() -> None:
     """Say so at their topic, which has an entry of its own then whether anything was heard of it or not."""
-    unheard = {
+    undiscovered = {
         topic: {'publishers': 1, 'nodes': [], 'seconds': 40, 'text': f'{topic} is not all heard'} for topic in ('/imu', '/odom')
     }
-    for topic in unheard:
-        assert told(topic, middleware__unheard=unheard) == (ERROR, f'{topic} is not all heard')
+    for topic in undiscovered:
+        assert told(topic, middleware__undiscovered=undiscovered) == (ERROR, f'{topic} is not all heard')
 
 
 def test_all_is_fine() -> None:

@@ -23,7 +23,7 @@ class _Kept:
     value: Any = None
 
 
-class KeptMessages:
+class MessageTrack:
     """Messages of one topic and type: one per ``every_ns``, and the newest. One thread adds, any reads; ``_lock`` guards."""
 
     def __init__(self, every_ns: int, type_name: str, read: Callable[[str, bytes], Any]) -> None:

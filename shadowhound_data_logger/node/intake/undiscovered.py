@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from shadowhound_data_logger.core.keys import printable
-from shadowhound_data_logger.core.status import UnheardTopic
+from shadowhound_data_logger.core.status import UndiscoveredTopic
 
 log = logging.getLogger(__name__)
 
 SETTLED_S: Final = 30.0
-"""How long the front must report a publisher before it counts as unheard. A killed publisher stays known for its lease (10 s by
-default with Cyclone DDS, 20 s with Fast DDS in ROS), and the two sides drop it at different moments.
+"""How long the front must report a publisher before it counts. A killed publisher stays known for its lease (10 s by default with
+Cyclone DDS, 20 s with Fast DDS in ROS), and the two sides drop it at different moments.
 """
 SILENT_S: Final = 30.0
 """After a longer silence of the front nothing is known, and counting restarts; it reports every other second, or every 20 s with
@@ -37,7 +37,7 @@ _Report = Mapping[str, Any]
 """{topic: [[gid, type, node], ...]}, as sent by the front; node is empty if unknown."""
 
 
-class Unheard:
+class UndiscoveredPublishers:
     """Publishers that the robot's RMW finds and the node does not.
 
     New; ``compare`` for each report of the front; ``rows`` at any time. Used by the main thread only.
@@ -55,7 +55,7 @@ class Unheard:
         self._monotonic = monotonic
         self._reported_s: float | None = None
         self._since_s: dict[tuple[str, str], float] = {}
-        self._rows: dict[str, UnheardTopic] = {}
+        self._rows: dict[str, UndiscoveredTopic] = {}
 
     def compare(self, report: _Report) -> dict[str, Any]:
         """Process a report of publishers that the node has not found; returns the input for the next one."""
@@ -74,7 +74,7 @@ class Unheard:
             del self._rows[topic]
         return {'topics': sorted(topics), 'gids': sorted(set().union(*known.values()))}
 
-    def rows(self) -> Mapping[str, UnheardTopic] | None:
+    def rows(self) -> Mapping[str, UndiscoveredTopic] | None:
         """The topics with such publishers, and a message about each; None without recent reports."""
         if self._reported_s is None or self._monotonic() - self._reported_s > SILENT_S:
             return None
@@ -93,7 +93,7 @@ class Unheard:
         count, what = (f'{len(publishers)}{more} publishers', 'they send') if len(publishers) > 1 else ('a publisher', 'it sends')
         text = (f'{topic} is not fully received: {self._robot} finds {count}{whose} that {self._rmw}, by which the node listens, '
                 f'has not found; what {what} is not logged')  # fmt: skip
-        self._rows[topic] = UnheardTopic(len(publishers), tuple(nodes), seconds, text)
+        self._rows[topic] = UndiscoveredTopic(len(publishers), tuple(nodes), seconds, text)
         if before is None or len(publishers) > before.publishers:
             log.error('%s, for %d s now: %s', text, seconds, REMEDY)
 

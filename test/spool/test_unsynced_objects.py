@@ -18,8 +18,8 @@ from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, SpooledObject
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.clock_record import BOOTS, ClockRecord, file
-from shadowhound_data_logger.spool.redating import STEP, Redating
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.unsynced_objects import STEP, UnsyncedObjects
 
 PATTERN = 'thor/camera/{date}/{time}_front.jpg'
 FINAL = 'thor/camera/20251018/120000_front.jpg'
@@ -33,14 +33,14 @@ class Run:
         self.watch = ClockWatch(clocks, hold_s, self.record.steps)
         self.spool = Spool(root, SpoolSettings(min_free_bytes=0), clocks, 'thor')
         self.spool.open()
-        self.redating = Redating(self.spool, self.watch, self.record, 'thor')
+        self.unsynced = UnsyncedObjects(self.spool, self.watch, self.record, 'thor')
         self.clocks = clocks
 
     def take(self, *fields: dict[str, Any]) -> list[SpooledObject]:
         """Objects whose messages were sent now, as the encoders make them."""
         items = [self.made(**each) for each in fields or ({},)]
         receive(self.spool, len(items))
-        return self.spool.commit([self.redating.mark(item) for item in items])
+        return self.spool.commit([self.unsynced.mark(item) for item in items])
 
     def made(self, key: str = 'thor/camera/19700101/000110_front.jpg', **fields: Any) -> DataObject:
         now_ns = self.watch.wall_ns() if self.watch.is_set else self.watch.boot_ns()
@@ -90,7 +90,7 @@ def test_it_waits_for_the_clock(started: Callable[..., Run], root: Path) -> None
     """Held, under a name by the boot clock, and nothing of it says 1970."""
     run = started()
     assert run.take() == []
-    assert run.redating.step() == []
+    assert run.unsynced.step() == []
     (row,) = rows(root)
     assert (row['state'], row['reason']) == ('held', 'clock')
     assert row['key'] == 'thor/_unsynced/this-boot/camera/00000060_000_camera.jpg'
@@ -108,7 +108,7 @@ def test_it_is_dated_when_the_clock_is_set(started: Callable[..., Run], root: Pa
     run = started() if restart else run
     clocks.wait(30)
     clocks.set(NOON_NS + 30 * SECOND)
-    items = run.redating.step()
+    items = run.unsynced.step()
     assert [item.key for item in items] == [FINAL, 'thor/camera/20251018/120000_front_1.jpg']
     assert [item.path.read_bytes() for item in items] == [b'one', b'two']
     row, metadata = rows(root)[0], said(root)[0]
@@ -118,7 +118,7 @@ def test_it_is_dated_when_the_clock_is_set(started: Callable[..., Run], root: Pa
     assert metadata['sensor'] == 'camera'
     assert 'key_pattern' not in metadata
     assert assert_whole(root)['objects']['pending'] == 2
-    assert run.redating.step() == []
+    assert run.unsynced.step() == []
 
 
 def test_objects_encoded_after_the_clock_was_set_are_dated_immediately(started: Callable[..., Run], clocks: Clocks) -> None:
@@ -126,7 +126,7 @@ def test_objects_encoded_after_the_clock_was_set_are_dated_immediately(started: 
     run = started()
     item = run.made()
     clocks.set()
-    dated = run.redating.mark(item)
+    dated = run.unsynced.mark(item)
     assert (dated.key, dated.held, dated.t_start_ns, dated.metadata['clock']) == (FINAL, None, NOON_NS, 'set_later')
 
 
@@ -134,7 +134,7 @@ def test_a_publisher_that_knows_the_time_is_believed(started: Callable[..., Run]
     """Its object goes under its date at once, though our clock is not set; by the boot clock it was just now."""
     run = started()
     item = run.made(FINAL, t_start_ns=NOON_NS, t_end_ns=NOON_NS + SECOND)
-    dated = run.redating.mark(item)
+    dated = run.unsynced.mark(item)
     assert (dated.key, dated.held, dated.metadata['clock']) == (FINAL, None, 'publisher')
     assert dated.metadata['boot_end_ns'] == str(clocks.boot_ns())
     assert dated.metadata['boot_start_ns'] == str(clocks.boot_ns() - SECOND)
@@ -145,12 +145,12 @@ def test_after_ten_minutes_they_go_without_a_date(started: Callable[..., Run], r
     run = started()
     run.take()
     clocks.wait(601)
-    assert [item.key for item in run.redating.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']
+    assert [item.key for item in run.unsynced.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']
     assert [item.key for item in run.take()] == ['thor/_unsynced/this-boot/camera/00000661_000_camera.jpg']
     assert [metadata['clock'] for metadata in said(root)] == ['unset', 'unset']
     assert not [metadata for metadata in said(root) if 't_start_ns' in metadata]
     clocks.set()
-    assert run.redating.step() == []
+    assert run.unsynced.step() == []
     assert run.take()[0].metadata['clock'] == 'set'
 
 
@@ -160,9 +160,9 @@ def test_what_an_earlier_boot_left(started: Callable[..., Run], root: Path, cloc
     clocks.boot_id, clocks.up_ns = 'next-boot', 20 * SECOND
     run = started()
     run.take()
-    assert [item.key for item in run.redating.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']
+    assert [item.key for item in run.unsynced.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']
     clocks.set()
-    assert [item.key for item in run.redating.step()] == [FINAL]
+    assert [item.key for item in run.unsynced.step()] == [FINAL]
 
 
 def test_objects_of_an_earlier_boot_with_a_set_clock(started: Callable[..., Run], clocks: Clocks) -> None:
@@ -172,7 +172,7 @@ def test_objects_of_an_earlier_boot_with_a_set_clock(started: Callable[..., Run]
     clocks.set()
     run.record.note(run.watch)
     clocks.boot_id, clocks.up_ns, clocks.offset_ns = 'next-boot', 20 * SECOND, 0
-    assert [item.key for item in started().redating.step()] == [FINAL]
+    assert [item.key for item in started().unsynced.step()] == [FINAL]
 
 
 def test_a_lost_index_costs_no_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
@@ -185,7 +185,7 @@ def test_a_lost_index_costs_no_date(started: Callable[..., Run], root: Path, clo
     run = started()
     assert run.spool.recovery.counts['files adopted'] == 1
     clocks.set()
-    assert [item.key for item in run.redating.step()] == [FINAL]
+    assert [item.key for item in run.unsynced.step()] == [FINAL]
     assert said(root)[0]['t_start_ns'] == str(NOON_NS)
 
 
@@ -198,7 +198,7 @@ def test_a_changed_key_pattern(started: Callable[..., Run], pattern: str, clocks
     broken = {**one.metadata, 'key_pattern': pattern}
     run.spool._connections.writing._db.execute('UPDATE objects SET metadata = ? WHERE id = ?', (json.dumps(broken), one.id))
     clocks.set()
-    keys = [item.key for item in run.redating.step()]
+    keys = [item.key for item in run.unsynced.step()]
     assert len(keys) == 2
     assert keys[0] in {one.key, 'thor/20251018'}
     assert keys[1] == 'x'
@@ -209,7 +209,7 @@ def test_many_are_named_in_steps(started: Callable[..., Run], clocks: Clocks) ->
     run = started()
     run.take(*({'body': b'%d' % number} for number in range(STEP + 5)))
     clocks.set()
-    counts = [len(run.redating.step()) for _ in range(3)]
+    counts = [len(run.unsynced.step()) for _ in range(3)]
     assert counts == [STEP, 5, 0]
 
 
@@ -217,15 +217,15 @@ def test_the_ledger_names_the_state(started: Callable[..., Run], root: Path, clo
     """Whether the clock is set, how often it stepped in all processes, and what waits for it."""
     run = started()
     run.take()
-    run.redating.step()
+    run.unsynced.step()
     assert ledger.read(root, 'thor')['clock'] == {
         'is_set': False, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 1,
     }  # fmt: skip
     clocks.set()
-    run.redating.step()
+    run.unsynced.step()
     run = started()
     clocks.offset_ns -= 5 * SECOND
-    run.redating.step()
+    run.unsynced.step()
     clock = ledger.read(root, 'thor')['clock']
     assert clock == {'is_set': True, 'steps': 2, 'last_step_s': -5.0, 'last_step_time': '2025-10-18T11:59:55.000000Z', 'held': 0}
 
@@ -238,7 +238,7 @@ def test_a_record_that_cannot_be_read(started: Callable[..., Run], root: Path, c
     run = started()
     run.take()
     clocks.set()
-    assert len(run.redating.step()) == 1
+    assert len(run.unsynced.step()) == 1
     assert ledger.read(root, 'thor')['clock']['steps'] == 1
 
 
@@ -250,7 +250,7 @@ def test_a_record_that_cannot_be_written(started: Callable[..., Run], root: Path
     file(root, 'thor').with_name('clock-thor.json.part').mkdir()
     clocks.set()
     with caplog.at_level(logging.WARNING):
-        assert len(run.redating.step()) == 1
+        assert len(run.unsynced.step()) == 1
     assert 'cannot record' in caplog.text
 
 
@@ -272,6 +272,6 @@ def test_a_held_object_that_has_a_date(started: Callable[..., Run], root: Path, 
     run = started()
     run.take()
     run.spool._connections.writing._db.execute('UPDATE objects SET t_start_ns = ?', (NOON_NS,))
-    assert run.redating.step() == []
+    assert run.unsynced.step() == []
     clocks.set()
-    assert [item.key for item in run.redating.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']
+    assert [item.key for item in run.unsynced.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']

@@ -3,7 +3,7 @@
 A time before 2024 is a time of the boot clock (``stamps.StampRule`` ensures that). An object that begins at such a time is held
 under ``<robot>/_unsynced/<boot_id>/<sensor>/<seconds since boot>``. Its metadata contain everything needed for its final name,
 so it survives a restart and a lost index. Once the clock is set, the offset between the clocks is known, and key, times and
-metadata are converted to UTC; the content is unchanged. ``dating.py`` decides on the offset and on how long an object waits for
+metadata are converted to UTC; the content is unchanged. ``UtcOffsets`` decides on the offset and on how long an object waits for
 it; objects without a date are shipped under their current names.
 
 The metadata of every object contain its times by the boot clock (``boot_id``, ``boot_start_ns``, ``boot_end_ns``), and in
@@ -20,8 +20,7 @@ from typing import Final
 
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.core.clock_watch import ClockWatch
-from shadowhound_data_logger.core.dating import Dating
+from shadowhound_data_logger.core.clock_watch import ClockWatch, UtcOffsets
 from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import dated, unsynced
 from shadowhound_data_logger.core.model import Binding, DataObject, HeldObject, SpooledObject
@@ -37,7 +36,7 @@ STEP: Final = 256
 _TIMES: Final = (meta.T_START_NS, meta.T_END_NS)
 
 
-class Redating:
+class UnsyncedObjects:
     """Holds objects while the clock is not set, and dates them once it is.
 
     Lifecycle: new; ``mark`` every object before it is spooled, on any thread; ``step`` once per second, on one thread.
@@ -46,7 +45,7 @@ class Redating:
     def __init__(self, spool: Spool, watch: ClockWatch, record: ClockRecord, robot: str) -> None:
         self._spool = spool
         self._watch = watch
-        self._dating = Dating(watch, watch.hold_s, record.offsets)
+        self._offsets = UtcOffsets(watch, watch.hold_s, record.offsets)
         self._record = record
         self._robot = robot
 
@@ -99,8 +98,8 @@ class Redating:
         return Binding(item.id, item.key, item.metadata, item.t_start_ns, item.t_end_ns)
 
     def _offset_of(self, boot_id: str) -> int | None:
-        """As ``Dating.offset_ns``. All objects stop waiting once the clock has been unset for too long."""
-        return self._dating.offset_ns(boot_id, self._watch.unset_since_ns)
+        """As ``UtcOffsets.of``. All objects stop waiting once the clock has been unset for too long."""
+        return self._offsets.of(boot_id, self._watch.unset_since_ns)
 
 
 def _boot(boot_id: str, start_ns: int, end_ns: int) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.node.intake.unheard import MAX_PUBLISHERS, SETTLED_S, SILENT_S, Unheard
+from shadowhound_data_logger.node.intake.undiscovered import MAX_PUBLISHERS, SETTLED_S, SILENT_S, UndiscoveredPublishers
 
 IMU = 'sensor_msgs/msg/Imu'
 STEP_S = 2.0
@@ -21,22 +21,23 @@ class Robot:
         self.theirs: dict[str, list[list[str]]] = {}
         self.ours: dict[str, set[str]] = {}
         self.topics = {f'/{name}': type_name for name, type_name in topics.items()}
-        self.unheard = Unheard('rmw_ours', 'rmw_theirs', lambda: self.topics, lambda topic: self.ours.get(topic, set()),
-                               monotonic=lambda: self.now_s)  # fmt: skip
+        self.undiscovered = UndiscoveredPublishers(
+            'rmw_ours', 'rmw_theirs', lambda: self.topics, lambda topic: self.ours.get(topic, set()), monotonic=lambda: self.now_s
+        )
 
     def wait(self, seconds: float) -> None:
         end_s = self.now_s + seconds
         while self.now_s <= end_s:
-            self.unheard.compare(self.theirs)
+            self.undiscovered.compare(self.theirs)
             self.now_s += STEP_S
 
     @property
     def texts(self) -> dict[str, str] | None:
-        rows = self.unheard.rows()
+        rows = self.undiscovered.rows()
         return None if rows is None else {topic: row.text for topic, row in rows.items()}
 
 
-def test_an_unheard_publisher_is_reported_until_it_is_found(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_undiscovered_publisher_is_reported_until_it_is_found(caplog: pytest.LogCaptureFixture) -> None:
     """Once in the log, with topic, node, both RMWs and what to do; and that it is over."""
     caplog.set_level(logging.INFO)
     robot = Robot(imu=IMU)
@@ -110,14 +111,14 @@ def test_only_what_would_be_logged_counts() -> None:
 def test_an_invalid_report_is_ignored(wrong: Any) -> None:
     """Whoever has the control socket may send what he likes."""
     robot = Robot(imu=IMU)
-    assert robot.unheard.compare({'/imu': wrong}) == {'topics': ['/imu'], 'gids': []}
+    assert robot.undiscovered.compare({'/imu': wrong}) == {'topics': ['/imu'], 'gids': []}
 
 
 def test_the_front_learns_the_known_publishers() -> None:
     """So that a report has only what is beyond that, and is short."""
     robot = Robot(imu=IMU, odom='')
     robot.ours = {'/imu': {'bb', 'aa'}, '/odom': {'cc'}}
-    assert robot.unheard.compare({}) == {'topics': ['/imu', '/odom'], 'gids': ['aa', 'bb', 'cc']}
+    assert robot.undiscovered.compare({}) == {'topics': ['/imu', '/odom'], 'gids': ['aa', 'bb', 'cc']}
 
 
 @pytest.mark.parametrize(('count', 'words'), [
