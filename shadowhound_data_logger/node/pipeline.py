@@ -79,6 +79,7 @@ from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.clock_record import ClockRecord
+from shadowhound_data_logger.spool.index_check import IndexCheck
 from shadowhound_data_logger.spool.operator_requests import OperatorRequests
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.topic_account import SINKS
@@ -199,6 +200,10 @@ class Pipeline:
         opened.callback(self._publish_status, ended=True)
         self.writer.open()
         opened.callback(self.writer.close, 1.0)
+        if not self.spool.recovery.is_checked:
+            check = IndexCheck(self.spool.root, self.writer.set_damaged)
+            check.open()
+            opened.callback(check.close)
         self.pool.open()
         self.uploader.open()
         opened.callback(self.uploader.close, 0.5)

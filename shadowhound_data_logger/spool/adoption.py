@@ -39,6 +39,8 @@ class Recovery:
     """What recovery did: description -> count; all zero after a clean shutdown."""
 
     counts: Counter[str] = field(default_factory=Counter)
+    is_checked: bool = False
+    """Whether the whole index was checked."""
 
     @property
     def found_anything(self) -> bool:
@@ -74,7 +76,7 @@ class Adoption:
         self._topics: dict[str, TopicRow] = {}
 
     def run(self) -> None:
-        for state, reason, bucket, key, path in self._tree.objects(self._in_place):
+        for state, reason, bucket, key, path in self._tree.objects(self._index.objects.keys_in_spool()):
             if not _is_valid_name(bucket, key):
                 self._foreign(path)
                 continue
@@ -98,12 +100,6 @@ class Adoption:
                 if len(self._group) >= GROUP_FILES:
                     self._adopt()
         self._adopt()
-
-    def _in_place(self, bucket: str, prefix: str) -> frozenset[str]:
-        """Keys of objects in the spool with this prefix, in one query: one per file would take seconds for 100,000 files."""
-        if not _is_valid_name(bucket, f'{prefix}x'):
-            return frozenset()
-        return self._index.objects.keys_in_spool(bucket, prefix)
 
     def _known(self, row: sqlite3.Row, sha256: str, path: Path, ready: Path) -> None:
         """A file whose object is missing or has left the spool."""

@@ -21,7 +21,7 @@ import os
 import re
 import stat
 import uuid
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -178,11 +178,8 @@ class Tree:
             return part
         return path
 
-    def objects(self, known: Callable[[str, str], Collection[str]]) -> Iterator[tuple[State, str | None, str, str, Path]]:
-        """(state, reason, bucket, key, path) of every regular file in the folders of objects.
-
-        ``known`` returns the keys to skip; it is called once per folder, with the bucket and the prefix of the keys.
-        """
+    def objects(self, known: Collection[tuple[str, str]]) -> Iterator[tuple[State, str | None, str, str, Path]]:
+        """(state, reason, bucket, key, path) of every regular file in the folders of objects, except those of ``known`` keys."""
         for state, name in _FOLDERS.items():
             folder = self.root / name
             depth = 1 if state in _WITHOUT_REASON else 2
@@ -192,8 +189,7 @@ class Tree:
                     continue
                 reason, bucket = None if depth == 1 else relative[0], relative[depth - 1]
                 prefix = ''.join(f'{part}/' for part in relative[depth:])
-                skipped = known(bucket, prefix)
-                for key in (key for file in names if (key := prefix + file) not in skipped):
+                for key in (key for file in names if (bucket, (key := prefix + file)) not in known):
                     path = folder.joinpath(*relative[:depth], key)
                     if self.size(path) is not None:
                         yield state, reason, bucket, key, path

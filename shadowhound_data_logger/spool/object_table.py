@@ -35,6 +35,11 @@ _PROTECTED: Final = "protected = 1, waits_for = CASE WHEN waits_for <> '' AND ev
 """SET clause for an object that must not be evicted from now on (``model.waits_for``)."""
 
 
+def in_state(state: State) -> str:
+    """The condition for objects in this state, worded so that SQLite uses the partial index of the state."""
+    return f"state = '{state.value}'"
+
+
 class ObjectTable(Table):
     """Reads the rows of objects, those that have left the spool among them."""
 
@@ -77,15 +82,13 @@ class ObjectTable(Table):
 
     def in_spool(self) -> list[sqlite3.Row]:
         """Rows of pending, held, kept and quarantined objects, in the order in which they were spooled."""
-        return self.select(f'{IN_SPOOL} ORDER BY id')
+        rows = [row for state in STATES_IN_SPOOL for row in self.select(in_state(state))]
+        return sorted(rows, key=itemgetter('id'))
 
-    def keys_in_spool(self, bucket: str, prefix: str) -> frozenset[str]:
-        """Keys with this prefix of pending, held, kept and quarantined objects, except those recorded as missing."""
-        rows = self._db.execute(
-            f'SELECT key FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND {IN_SPOOL} AND reason IS NOT ?',  # noqa: S608
-            (bucket, prefix, after(prefix), MISSING),
-        )
-        return frozenset(key for (key,) in rows)
+    def keys_in_spool(self) -> frozenset[tuple[str, str]]:
+        """(bucket, key) of pending, held, kept and quarantined objects, except those recorded as missing."""
+        query = 'SELECT bucket, key FROM objects WHERE {} AND reason IS NOT ?'
+        return frozenset(row for state in STATES_IN_SPOOL for row in self._db.execute(query.format(in_state(state)), (MISSING,)))
 
     def quarantined(self, reason: str | None = None) -> list[sqlite3.Row]:
         """Rows of quarantined objects with files, for this reason or any."""

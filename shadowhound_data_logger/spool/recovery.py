@@ -31,7 +31,7 @@ from shadowhound_data_logger.spool.ballast import is_disk_full
 from shadowhound_data_logger.spool.binding import renew
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import DROPPED, EXACT, GapRow, TopicGaps
-from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.index import Index, suspicion_of
 from shadowhound_data_logger.spool.ledger import imbalances, of_index
 from shadowhound_data_logger.spool.object_table import MISSING, STATES_IN_SPOOL
 from shadowhound_data_logger.spool.session import SessionFiles
@@ -41,6 +41,8 @@ log = logging.getLogger(__name__)
 
 DAMAGED: Final = 'damaged'
 REBUILT: Final = 'damaged index rebuilt'
+CHECKED_FIRST_BYTES: Final = 8 << 20
+"""An index up to this size is checked before it is used, which takes 0.1 s; a larger one while it is in use (index_check.py)."""
 MICROSECOND: Final = 1000
 _DAMAGE_MESSAGES: Final = ('malformed', 'disk I/O', 'already exists', 'no such', 'decode', 'unsupported file format')
 
@@ -58,8 +60,7 @@ def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
         has_log = bool(Tree.size(Path(f'{path}-wal')))
         try:
             index.open()
-            index.check()
-            index.check_values()
+            _check(index, path, report)
             _recover(tree, index, now_ns, report, has_log=has_log)
         except (sqlite3.Error, ValueError, TypeError, AttributeError, OverflowError) as error:
             index.close()
@@ -73,6 +74,17 @@ def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
             raise
         else:
             return index
+
+
+def _check(index: Index, path: Path, report: Recovery) -> None:
+    """Check all of a small or suspected index, of another one what the recovery uses: the node checks the rest later."""
+    suspicion = suspicion_of(path)
+    report.is_checked = path.stat().st_size <= CHECKED_FIRST_BYTES or suspicion.exists()
+    if report.is_checked:
+        index.check()
+        suspicion.unlink(missing_ok=True)
+    else:
+        index.check_spool()
 
 
 def _is_damage(path: Path, error: Exception) -> bool:
@@ -94,7 +106,7 @@ def _set_aside(path: Path) -> None:
     while (target := path.with_name(f'{path.name}.damaged-{number}')).exists():
         number += 1
     os.replace(path, target)
-    for suffix in ('-wal', '-shm'):
+    for suffix in ('-wal', '-shm', '.suspect'):
         Path(f'{path}{suffix}').unlink(missing_ok=True)
 
 

@@ -131,6 +131,12 @@ class SpoolWriter:
                 self._changed.notify_all()
         self._remove_files(FILES_PER_OUTCOME * len(outcomes), wait=False)
 
+    def set_damaged(self) -> None:
+        """The index is damaged: end every wait for a commit."""
+        with self._changed:
+            self.damaged = True
+            self._changed.notify_all()
+
     def written(self) -> tuple[int, int]:
         """How many objects, and messages in them, became durable since the writer was opened."""
         with self._changed:
@@ -177,9 +183,7 @@ class SpoolWriter:
         except (OSError, sqlite3.OperationalError) as error:
             raise self.spool.unwritable(error) from error
         except sqlite3.DatabaseError:
-            with self._changed:
-                self.damaged = True
-                self._changed.notify_all()
+            self.set_damaged()
             raise
 
     def _remove_files(self, limit: float = math.inf, until: Callable[[], bool] = lambda: False, *, wait: bool = True) -> None:

@@ -157,3 +157,26 @@ def abandon(spool: Spool) -> None:
     spool._connections.writing.close()
     assert spool._session is not None
     os.close(spool._session._lock)
+
+
+_COPIES = """
+INSERT INTO objects WITH RECURSIVE series (value) AS (SELECT 1 UNION ALL SELECT value + 1 FROM series WHERE value < ?)
+SELECT {} FROM objects, series WHERE id = (SELECT id FROM objects WHERE state = 'delivered' LIMIT 1)"""
+
+
+def fill(root: Path, count: int) -> None:
+    """Add rows of as many delivered objects, without messages, to the index of a closed spool that has one of them."""
+    with closing(sqlite3.connect(root / 'index.db')) as db, db:
+        columns = [row[1] for row in db.execute('PRAGMA table_info(objects)')]
+        values = ', '.join({'id': 'NULL', 'key': "key || '-' || value", 'samples': '0'}.get(name, name) for name in columns)
+        db.execute(_COPIES.format(values), (count,))
+
+
+def damage_old_rows(root: Path) -> None:
+    """Make a page with rows of delivered objects unreadable, which no commit and no upload opens."""
+    path = root / 'index.db'
+    content = bytearray(path.read_bytes())
+    pages = range(len(content) // 4096 // 2 * 4096, len(content), 4096)
+    leaf = next(page for page in pages if content[page] == 13 and b'-' in content[page : page + 4096])  # a leaf of a table
+    content[leaf : leaf + 4096] = bytes(4096)
+    path.write_bytes(content)

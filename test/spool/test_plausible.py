@@ -28,7 +28,7 @@ def index(opened: Open, root: Path) -> Path:
 def test_what_is_ours_is_not_doubted(index: Path) -> None:
     """No value that the spool itself wrote is called impossible, and its totals are those of its objects."""
     with index_of(index.parent) as whole:
-        whole.check_values()
+        whole.check()
         assert list(whole.miscounted()) == []
 
 
@@ -48,7 +48,7 @@ def test_what_cannot_be_ours_is_found(index: Path, opened: Open, change: str) ->
         db.execute(f'UPDATE {change}')
         db.commit()
     with index_of(index.parent) as damaged, pytest.raises(sqlite3.DatabaseError, match='impossible value'):
-        damaged.check_values()
+        damaged.check()
     assert opened().recovery.counts['damaged index rebuilt'] == 1
 
 
