@@ -247,7 +247,7 @@ class Weeks:
         for _ in range(20):
             self.server._poll_at_s = 0.0  # it polls immediately
             self.server.step()
-            if any(row.id == asked.id for row in self.spool.requests.rows()):
+            if any(row.id == asked.id for row in self.spool.reading.requests.rows()):
                 break
         else:
             self.faults.append(f'{iso(self.clock.now_ns)}: a request was not accepted')

@@ -111,6 +111,6 @@ class BagContext:
         """Whether a bag other than ``by`` has the name. A restart may find a bag whose slices were delivered already."""
         first = key_of(self.robot, bag, slice_file(bag, 0))
         own = by.slices.get(slice_file(by.folder.name, 0)) if by is not None else None
-        if own is not None and self.spool.knows(BUCKET, first, own.sha256):
+        if own is not None and self.spool.reading.objects.knows(BUCKET, first, own.sha256):
             return False
-        return (self.root / bag).exists() or self.spool.has(BUCKET, first)
+        return (self.root / bag).exists() or self.spool.reading.objects.row(BUCKET, first) is not None

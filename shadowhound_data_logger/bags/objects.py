@@ -61,7 +61,8 @@ def finish(state: BagState, writer: SpoolWriter, deadline_s: float) -> bool:
     if not writer.flush(deadline_s):
         return False
     if not state.is_ending:
-        states = writer.spool.states(BUCKET, prefix_of(state.robot, state.bag))
+        rows = writer.spool.reading.objects.with_prefix(BUCKET, prefix_of(state.robot, state.bag))
+        states = {row['key']: State(row['state']) for row in rows}
         ending: Iterable[DataObject] = ()
         if (state.slices or (state.ended and state.missing)) and key_of(state.robot, state.bag, MANIFEST) not in states:
             _note_evicted(state, states)

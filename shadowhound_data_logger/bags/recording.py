@@ -204,7 +204,7 @@ class Recording:
         except OSError as error:
             self._abandon_slice(error)
             return
-        if not self._context.spool.has_room():
+        if not self._context.spool.room.has_for_bags():
             self.split()  # the next slice is refused
         elif self._monotonic() - self._slice_started_s >= self._settings.slice_s:
             self.split()
@@ -275,7 +275,7 @@ class Recording:
         now_s = self._monotonic()
         if now_s < self._retry_at_s:
             return False
-        if not self._context.spool.has_room():
+        if not self._context.spool.room.has_for_bags():
             self._refuse(NO_ROOM, 'there is no room')
             return False
         if not self._recover_broken():

@@ -250,7 +250,7 @@ class BagRecovery:
         item = slice_object(state, info, self._priority, is_kept=self._context.keeps(state))
         if item.key in self._spooled:
             return
-        if self._context.spool.knows(item.bucket, item.key, content_sha256(item.body)):
+        if self._context.spool.reading.objects.knows(item.bucket, item.key, content_sha256(item.body)):
             self._context.writer.put(rows=[rows], wait=False)
             path.unlink(missing_ok=True)
             return
@@ -301,7 +301,8 @@ def _number_runs(path: Path) -> tuple[dict[str, list[NumberRun]], dict[str, Time
 def _rows(context: BagContext) -> dict[str, RecordingRows]:
     """The rows of the recordings in the index, by folder."""
     try:
-        return {rows.folder: rows for rows in context.spool.recordings() if is_name(rows.folder, MAX_BAG_BYTES)}
+        found = context.spool.reading.recordings.rows(context.spool.robot)
+        return {rows.folder: rows for rows in found if is_name(rows.folder, MAX_BAG_BYTES)}
     except sqlite3.Error as error:
         log.warning('the index cannot be read, so bags are completed from their slices: %s', error)
         return {}

@@ -26,6 +26,7 @@ from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObje
 from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.shipping.uploader import Uploader, delivering
+from shadowhound_data_logger.spool.ballast import unwritable
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits
@@ -110,7 +111,7 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
         try:
             _check_names(spool, plan)
             for place, file in enumerate(plan.files):
-                if spool.knows(BUCKET, file.key, file.sha256):
+                if spool.reading.objects.knows(BUCKET, file.key, file.sha256):
                     continue
                 link = Path(work) / str(place)
                 _link_or_copy(file.path, link)
@@ -118,7 +119,7 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
             for begin in range(0, len(objects), MAX_OBJECTS):  # the manifest is the last
                 placed += spool.commit(objects[begin : begin + MAX_OBJECTS])
         except sqlite3.Error as error:
-            raise spool.unwritable(error) from error
+            raise unwritable(spool.root, error) from error
     if len(placed) < len(objects):
         remedy = 'raise spool.max_bytes, or use --direct to upload it without the spool'
         raise BagError(f'the spool {spool.root} has no room for {plan.bag}: {plan.size} bytes', remedy=remedy)

@@ -24,6 +24,7 @@ from shadowhound_data_logger.missions.folder import MissionFolder, Run, timestam
 from shadowhound_data_logger.missions.state import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import delivering
+from shadowhound_data_logger.spool.ballast import unwritable
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
@@ -131,7 +132,7 @@ class Spooler:
     def bind(self, mission_id: str, run_id: str) -> bool:
         """Give the held objects of a mission their final keys; returns whether there were any. Raises SpoolError."""
         with self._using(self._opened()) as spool:
-            found = spool.held(held_reason(mission_id))
+            found = spool.reading.objects.held(held_reason(mission_id))
             spool.bind([
                 Binding(item.id, item.key.replace(f'/missions/{mission_id}/', f'/missions/{run_id}/', 1),
                         {**item.metadata, meta.RUN_ID: run_id}, item.t_start_ns, item.t_end_ns)
@@ -187,7 +188,7 @@ class Spooler:
         if self._spool is None or not self._settings.catalog.enabled:
             return False
         with self._using(self._spool) as spool:
-            return spool.has_uncataloged()
+            return bool(spool.reading.catalog.uncataloged(1))
 
     def _drain(self, spool: Spool) -> None:
         with delivering(spool, self._settings, SLICE_S) as (uploader, writer):
@@ -207,12 +208,12 @@ class Spooler:
         try:
             yield spool
         except (OSError, sqlite3.OperationalError) as error:
-            raise spool.unwritable(error) from error
+            raise unwritable(spool.root, error) from error
         except (SpoolError, sqlite3.DatabaseError) as error:
             self._spool = None
             with suppress(SpoolError):
                 spool.close()
-            raise spool.unwritable(error) if isinstance(error, sqlite3.Error) else error from error
+            raise unwritable(spool.root, error) if isinstance(error, sqlite3.Error) else error from error
 
     def _opened(self) -> Spool:
         self._used_s = self._monotonic()

@@ -44,6 +44,7 @@ from shadowhound_data_logger.core.clock import SECOND, SystemClock, now_ns, utc
 from shadowhound_data_logger.core.clock_watch import ClockWatch
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
 from shadowhound_data_logger.core.dataclass_json import fields_of
+from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.core.keys import dated
 from shadowhound_data_logger.core.model import DataObject
@@ -135,7 +136,9 @@ class Pipeline:
         opened.callback(self._store.close)
         self.spool.open()
         opened.callback(self.spool.close)
-        if not opened.enter_context(self.spool.node_lock()):
+        # A second node would count and store all messages again.
+        node_lock = flock(self.spool.root / f'node-{settings.robot}.lock', wait=False)
+        if not opened.enter_context(node_lock):
             raise SpoolError(f'another sensor_logger_node already logs {settings.robot} to {self.spool.root}',
                              remedy='stop it, or give this one another robot name or SHADOWHOUND_HOME')  # fmt: skip
         for sink in SINKS:
@@ -323,7 +326,7 @@ class Pipeline:
         self._link: LinkTrack | None = None
         settings = self._settings
         ships = {settings.bag.ship, *(sensor.ship for sensor in settings.sensors)}
-        if ON_REQUEST not in ships and not (self.spool.kept.bytes() or self.spool.requests.is_any_open()):
+        if ON_REQUEST not in ships and not (self.spool.reading.kept.bytes() or self.spool.reading.requests.open_count()):
             return
         sweep(settings.home, settings.robot)
         self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)

@@ -158,20 +158,20 @@ class RequestServer:
             self._poll_at_s = now_s + self._settings.poll_s
             self._poll()
             self._look()
-        rows = self._spool.requests.rows()
+        rows = self._spool.reading.requests.rows()
         now_ns = self._clock.wall_ns()
         for row in rows:
             if row.is_open and row.expires_ns <= now_ns:
                 self._spool.requests.close(row.id, EXPIRED)
         rows = [row for row in rows if row.is_open and row.expires_ns > now_ns]
         is_busy = self._may_send() and self._release(rows) | self._cuts.work({row.id for row in rows})
-        for row in self._spool.requests.rows():
+        for row in self._spool.reading.requests.rows():
             if row.answered_state != row.state or row.is_open:
                 self._answer(row)
         if now_s >= self._tidy_at_s:
             self._tidy_at_s = now_s + TIDY_S
             self._spool.requests.forget(now_ns - REMEMBER_NS)
-            asking, known = {row.requester for row in rows}, {row.id for row in self._spool.requests.rows()}
+            asking, known = {row.requester for row in rows}, {row.id for row in self._spool.reading.requests.rows()}
             self._served = {name: served for name, served in self._served.items() if name in asking}
             self._answering = {name: number for name, number in self._answering.items() if name in known}
             while self._spool.kept.evict_old():
@@ -201,7 +201,8 @@ class RequestServer:
 
     def _look(self) -> None:
         """Count the open requests and their bytes."""
-        count, size = self._spool.requests.open()
+        index = self._spool.reading
+        count, size = index.requests.open_count(), index.requested.unreleased_bytes()
         mbps = self._mbps()
         self.status = RequestStatus(count, size, mbps, round(8e-6 * size / mbps) if mbps else None)
 
@@ -236,7 +237,7 @@ class RequestServer:
 
     def _handle_requests(self, reads: Sequence[PullRequest | PullCancel]) -> bool:
         """Whether all of it is done. Raises StoreError."""
-        known = {row.id: row for row in self._spool.requests.rows()}
+        known = {row.id: row for row in self._spool.reading.requests.rows()}
         new, cancels = dict[str, PullRequest](), []
         for read in reads:
             row = known.get(read.id)
@@ -246,7 +247,7 @@ class RequestServer:
                 new.setdefault(read.id, read)
         if (beyond := len(known) + len(new) - MAX_REQUESTS) > 0:
             self._spool.requests.forget(self._clock.wall_ns(), beyond)
-            known = {row.id: row for row in self._spool.requests.rows()}
+            known = {row.id: row for row in self._spool.reading.requests.rows()}
         room = max(0, MAX_REQUESTS - len(known))
         if len(new) > room:
             self._refuse('too_many', 'too many requests are open')
@@ -304,11 +305,11 @@ class RequestServer:
         """Let the next objects wait for delivery; whether there are any."""
         mbps = self._mbps()
         window = WINDOW_BYTES if mbps is None else min(max(round(WINDOW_S * mbps * 125_000), MIN_WINDOW), MAX_WINDOW)
-        count, size = self._spool.requests.released()
+        count, size = self._spool.reading.requested.released()
         if not rows or count > WINDOW // 2 or size > window // 2:
             return False
         room, room_bytes = WINDOW - count, window - size
-        queues = {row.id: deque(self._spool.requests.unreleased(row.id, room)) for row in rows}
+        queues = {row.id: deque(self._spool.reading.requested.unreleased(row.id, room)) for row in rows}
         chosen: dict[int, int] = {}
         while len(chosen) < room and (row := self._next([row for row in rows if queues[row.id]])) is not None:
             number, size, is_cut = queues[row.id].popleft()
@@ -345,7 +346,7 @@ class RequestServer:
         """Spool the next answer of a request, if one is due."""
         if self._answering.get(row.id, 0) > row.answers:
             return
-        if row.is_open and self._spool.requests.is_settled(row.id):
+        if row.is_open and self._spool.reading.requested.is_settled(row.id):
             self._spool.requests.close(row.id, DONE)
             self._finished()
             row = replace(row, state=DONE)
@@ -354,7 +355,7 @@ class RequestServer:
             return
         if not row.is_open:
             self._spool.requests.let_go(row.id)
-        progress = self._spool.requests.progress(row.id)
+        progress = self._spool.reading.requested.progress(row.id)
         if not row.is_open and progress.outcomes.get('pending'):
             return  # the released objects are still delivered, and the last answer reports them
         number = row.answers + 1

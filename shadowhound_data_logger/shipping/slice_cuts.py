@@ -69,7 +69,7 @@ class SliceCuts:
         wanted = json.loads(row.selection)
         cut = self._cutter([each for each in slices if each.key.rpartition('/')[0] == folder], wanted.get('since_ns', 0),
                            wanted.get('until_ns', LATEST_NS), row.priority)  # fmt: skip
-        if self._spool.has(*cut.places[-1]):  # cut for another request, or before the node was killed
+        if self._spool.reading.objects.row(*cut.places[-1]) is not None:  # cut for another request, or before the node was killed
             self._set_cut(row, cut, cut.places)
         else:
             self._cutting = _Cutting(row, cut, cut.work())

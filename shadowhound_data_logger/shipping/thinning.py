@@ -10,8 +10,8 @@ from typing import Final
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.core.options import BULK
+from shadowhound_data_logger.spool.kept_objects import ThinnableObject, Thinned
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.spool.thinning import ThinnableObject, Thinned
 
 log = logging.getLogger(__name__)
 

@@ -126,7 +126,7 @@ class Adoption:
             self._session = self._session or self._index.accounts.begin_session('recovered', '', 0, self._now_ns)
             for found in self._group:
                 item = found.item
-                if self._index.objects.has(item.bucket, item.key):
+                if self._index.objects.row(item.bucket, item.key) is not None:
                     self._foreign(found.path)  # the same key was in two folders: the first one counts
                     continue
                 self._index.states.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
 
+from shadowhound_data_logger.core.errors import SpoolError
+
 log = logging.getLogger(__name__)
 
 BALLAST_BYTES: Final = 8 << 20
@@ -72,6 +74,13 @@ class Ballast:
             return False
         log.warning('the disk is full: the spool %s uses its reserve of %d bytes; free some space', self._path.parent, size)
         return size > 0
+
+
+def unwritable(root: Path, error: OSError | sqlite3.Error) -> SpoolError:
+    """The error to show an operator after a failed commit."""
+    full = os.strerror(errno.ENOSPC)  # one text for SQLite's and the kernel's error, so that it is logged once
+    reason = full if is_disk_full(error, root) else getattr(error, 'strerror', None) or error
+    return SpoolError(f'the spool {root} cannot be written: {reason}', remedy='is its disk full, read-only or broken?')
 
 
 def is_disk_full(error: Exception, folder: Path) -> bool:

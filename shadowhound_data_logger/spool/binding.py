@@ -15,11 +15,11 @@ from typing import Any
 
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.core.keys import check_key, unique
+from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import Binding, SpooledObject, State
 from shadowhound_data_logger.spool.files import Tree, describe
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.object_table import MISSING, spooled
+from shadowhound_data_logger.spool.object_table import spooled
 
 _Row = Mapping[str, Any]
 """As ``ObjectTable.full_row`` returns it."""
@@ -79,37 +79,6 @@ def renew(index: Index, number: int, path: Path) -> None:
         _describe(path, row)
 
 
-def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> str:
-    """The wanted key, or the first of its variants ``_1``, ``_2``, ... that was never used or is the object's ``own``.
-
-    Variants are used in order, so a binary search finds the first free one: many objects with the same wanted key must not
-    block other writers.
-    """
-
-    def is_free(attempt: int) -> bool:
-        return (key := unique(wanted, attempt)) == own or not index.objects.has(bucket, key)
-
-    if is_free(0):
-        return wanted
-    taken, free = 0, 1
-    while not is_free(free):
-        taken, free = free, 2 * free
-    while free - taken > 1:
-        middle = (taken + free) // 2
-        taken, free = (taken, middle) if is_free(middle) else (middle, free)
-    return unique(wanted, free)
-
-
-def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
-    """Whether an object with this content has the wanted key or one of its variants, and its file is not missing."""
-    attempt = 0
-    while (row := index.objects.row(bucket, unique(wanted, attempt))) is not None:
-        if row['sha256'] == sha256 and row['reason'] != MISSING:
-            return True
-        attempt += 1
-    return False
-
-
 def _to_part(tree: Tree, row: _Row) -> bool:
     """Move an object's file to its part; True also if the file is missing, which the uploader will report."""
     path = _own_path(tree, row)
@@ -121,7 +90,7 @@ def _own_path(tree: Tree, row: _Row) -> Path:
 
 
 def _change(index: Index, row: _Row, binding: Binding, now_ns: int) -> None:
-    key = free_key(index, row['bucket'], binding.key, row['key'])
+    key = index.objects.free_key(row['bucket'], binding.key, row['key'])
     metadata = {**binding.metadata, meta.SHA256: row['sha256']}
     created_ns = row['created_ns']
     if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set; the waiting time is computed from this

@@ -21,7 +21,6 @@ from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State, waits_for
-from shadowhound_data_logger.spool.binding import free_key
 from shadowhound_data_logger.spool.files import Tree, content_sha256, describe, description, facts
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.object_table import MISSING
@@ -132,7 +131,7 @@ class NewObjects:
             state, reason = State.EVICTED, NO_ROOM
         elif not is_staged(self._tree, item.body):
             state, reason = State.QUARANTINED, MISSING
-        key = free_key(self._index, item.bucket, check_key(item.key))
+        key = self._index.objects.free_key(item.bucket, check_key(item.key))
         sha256 = content_sha256(item.body)
         metadata = {**facts(item), meta.SHA256: sha256}
         if state is State.PENDING:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core import metadata_keys as meta
+from shadowhound_data_logger.core.keys import unique
 from shadowhound_data_logger.core.model import (
     EVENTS_WHEN,
     UPLOAD_WHEN,
@@ -45,12 +46,41 @@ class ObjectTable(Table):
 
     # -- by key or number ------------------------------------------------------------------------------------------
 
-    def has(self, bucket: str, key: str) -> bool:
-        return self.row(bucket, key) is not None
-
     def row(self, bucket: str, key: str) -> sqlite3.Row | None:
         """The row of a key."""
         return next(iter(self.select('bucket = ? AND key = ?', (bucket, key))), None)
+
+    def free_key(self, bucket: str, wanted: str, own: str | None = None) -> str:
+        """The wanted key, or the first of its variants ``_1``, ``_2``, ... that was never used or is the object's ``own``.
+
+        Variants are used in order, so a binary search finds the first free one: many objects with the same wanted key must not
+        block other writers.
+        """
+
+        def is_free(attempt: int) -> bool:
+            return (key := unique(wanted, attempt)) == own or self.row(bucket, key) is None
+
+        if is_free(0):
+            return wanted
+        taken, free = 0, 1
+        while not is_free(free):
+            taken, free = free, 2 * free
+        while free - taken > 1:
+            middle = (taken + free) // 2
+            taken, free = (taken, middle) if is_free(middle) else (middle, free)
+        return unique(wanted, free)
+
+    def knows(self, bucket: str, wanted: str, sha256: str) -> bool:
+        """Whether this content was spooled under this (wanted) key, whatever became of it: its source is no longer needed.
+
+        Objects that left the spool ``spool.remember_days`` ago are forgotten, and those whose file is missing do not count.
+        """
+        attempt = 0
+        while (row := self.row(bucket, unique(wanted, attempt))) is not None:
+            if row['sha256'] == sha256 and row['reason'] != MISSING:
+                return True
+            attempt += 1
+        return False
 
     def full_row(self, number: int) -> Mapping[str, Any] | None:
         """All columns of an object, and ``counts``: messages by account if it has several."""
@@ -94,7 +124,7 @@ class ObjectTable(Table):
         """Rows of quarantined objects with files, for this reason or any."""
         return self.select("state = 'quarantined' AND reason = ifnull(?, reason) AND reason <> ? ORDER BY id", (reason, MISSING))
 
-    def held(self, reason: str, limit: int) -> list[HeldObject]:
+    def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
         """Objects without a final name for this reason, oldest first."""
         rows = self._db.execute(
             "SELECT id, bucket, key, metadata, t_start_ns, t_end_ns, created_ns FROM objects WHERE state = 'held' AND reason = ?"

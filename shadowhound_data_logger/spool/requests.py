@@ -14,10 +14,8 @@ from shadowhound_data_logger.spool.request_table import (
     PIECE,
     KeptObject,
     KeptSlice,
-    Progress,
     RequestedTable,
     RequestRow,
-    UnreleasedObject,
 )
 
 
@@ -32,39 +30,10 @@ class Requests:
         self._tree = tree
         self._robot = robot
 
-    def rows(self) -> list[RequestRow]:
-        """All known requests, open and closed."""
-        return self._connections.reading.requests.rows()
-
-    def is_any_open(self) -> bool:
-        """Whether a requester waits for an answer."""
-        return self._connections.reading.requests.open_count() > 0
-
-    def progress(self, request: str) -> Progress:
-        """What became of the objects that a request selected."""
-        return self._connections.reading.requested.progress(request)
-
-    def is_settled(self, request: str) -> bool:
-        """Whether a request waits for no object."""
-        return self._connections.reading.requested.is_settled(request)
-
-    def unreleased(self, request: str, limit: int) -> list[UnreleasedObject]:
-        """Kept objects that a request waits for and that no request has released, oldest first."""
-        return self._connections.reading.requested.unreleased(request, limit)
-
     def to_cut(self, request: str) -> list[KeptSlice]:
         """Kept slices that the request needs only partly, oldest first."""
         return [KeptSlice(number, key, self._tree.path(State.KEPT, None, bucket, key), sha256, metadata)
                 for number, bucket, key, sha256, metadata in self._connections.reading.requested.to_cut(request)]  # fmt: skip
-
-    def released(self) -> tuple[int, int]:
-        """Requested objects that wait for delivery: how many, and their bytes."""
-        return self._connections.reading.requested.released()
-
-    def open(self) -> tuple[int, int]:
-        """How many requests are open, and the bytes that they wait for and that are not released yet."""
-        index = self._connections.reading
-        return index.requests.open_count(), index.requested.unreleased_bytes()
 
     def selectable(self) -> Iterator[KeptObject]:
         """What a request may select of this robot: objects kept, released but not delivered, or lost within the last hour."""

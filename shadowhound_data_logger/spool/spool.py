@@ -8,9 +8,7 @@ rename that did not happen. No file is written or synced inside the transaction:
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
 import sqlite3
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -22,25 +20,25 @@ from shadowhound_data_logger.core.clock import SECOND, Clock
 from shadowhound_data_logger.core.config import KeepSettings, SpoolSettings
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import SpoolError
-from shadowhound_data_logger.core.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
+from shadowhound_data_logger.core.model import Binding, DataObject, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.core.status import SpoolStatus
 from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adoption import Recovery
-from shadowhound_data_logger.spool.ballast import Ballast, is_disk_full
+from shadowhound_data_logger.spool.ballast import Ballast, unwritable
 from shadowhound_data_logger.spool.connections import Connections
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.keeping import KEEP, KeptObjects
+from shadowhound_data_logger.spool.kept_objects import KeptObjects
 from shadowhound_data_logger.spool.new_objects import NewObjects, remove_sources, staged
 from shadowhound_data_logger.spool.object_table import spooled
 from shadowhound_data_logger.spool.recovery import open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.requests import Requests
-from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, is_short, make_room
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Room
 from shadowhound_data_logger.spool.session import Session, SessionFiles, carry
 
 log = logging.getLogger(__name__)
@@ -52,6 +50,7 @@ PUT_BACK_S: Final = 2.5
 DAY_NS: Final = 24 * 3600 * SECOND
 MAX_OBJECTS: Final = 32
 """Per commit: their rows take about 5 ms, during which other processes wait."""
+KEEP: Final = KeepSettings()
 _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
 
 
@@ -59,7 +58,7 @@ class Spool:
     """The durable queue on disk: objects, their states and the accounts, in one transaction.
 
     Lifecycle: new; open once; commit, pending, ... from any thread; close once. ``requests`` and ``kept`` are the parts of its
-    state that concern objects kept on the robot.
+    state that concern objects kept on the robot, ``room`` the space for objects; ``reading`` answers everything else.
 
     ``_connections.lock`` guards the writing connection and makes a commit and its renames one step for ``pending``.
     """
@@ -69,17 +68,16 @@ class Spool:
         self.robot = robot
         self.accounts = Accounts()
         self.recovery = Recovery()
-        self.shortage = Shortage(root)
         self._settings = settings
-        self._keep = keep
         self._clock = clock
         self._tree = Tree(root)
+        self.room = Room(self._tree, settings, keep)
         self._connections = Connections(root)
         self._session: Session | None = None
         self._forgot_ns = 0
         self._ballast = Ballast(root / 'ballast')
         self.requests = Requests(self._connections, self._tree, robot)
-        self.kept = KeptObjects(self._connections, self._tree, self._ballast, settings, keep, clock)
+        self.kept = KeptObjects(self._connections, self._tree, self._ballast, self.room, clock)
         self._repeats = Repeats()
 
     def open(self) -> None:
@@ -111,7 +109,7 @@ class Spool:
                 self._ballast.work(lambda: session.end(self._connections.writing, snapshot, self._clock.wall_ns()))
             except (OSError, sqlite3.OperationalError) as error:
                 self.accounts.mark_dirty()
-                raise self.unwritable(error) from error
+                raise unwritable(self.root, error) from error
             except sqlite3.DatabaseError as error:
                 self._end(session)
                 raise SpoolError(f'the index of the spool {self.root} is damaged: {error}',
@@ -137,6 +135,14 @@ class Spool:
             self.remove_files(follow)
         return placed
 
+    @property
+    def reading(self) -> Index:
+        """The index, for reading: waits for no commit. Do not keep it, because it is replaced if its file is deleted.
+
+        Reads raise sqlite3.Error; SpoolError while the spool is not open.
+        """
+        return self._connections.reading
+
     def remove_files(self, outcomes: Iterable[Outcome]) -> None:
         """Move or delete the files of committed outcomes; after a kill, the next startup does it."""
         for outcome in outcomes:
@@ -145,27 +151,6 @@ class Spool:
                 self._set_apart(item, outcome.reason)
             elif outcome.state in _LEFT and not self._tree.remove(item.path):
                 self._tree.remove(self._tree.place_pending(item.id, item.bucket, item.key))
-
-    def fits(self, objects: Sequence[DataObject]) -> bool:
-        """Whether there is room for all of them without deleting anything first. Raises OSError."""
-        return fits(self._tree, objects)
-
-    def is_short(self, objects: Sequence[DataObject]) -> bool:
-        """Whether something must be evicted to make room for them. Raises OSError."""
-        return is_short(self._tree, self._settings, objects)
-
-    def knows(self, bucket: str, key: str, sha256: str) -> bool:
-        """Whether this content was spooled under this (wanted) key, whatever became of it: its source is no longer needed.
-
-        Waits for no commit; objects that left the spool ``spool.remember_days`` ago are forgotten. Raises sqlite3.Error.
-        """
-        return binding.knows(self._connections.reading, bucket, key, sha256)
-
-    def unwritable(self, error: OSError | sqlite3.Error) -> SpoolError:
-        """The error to show an operator after a failed commit."""
-        full = os.strerror(errno.ENOSPC)  # one text for SQLite's and the kernel's error, so that it is logged once
-        reason = full if is_disk_full(error, self.root) else getattr(error, 'strerror', None) or error
-        return SpoolError(f'the spool {self.root} cannot be written: {reason}', remedy='is its disk full, read-only or broken?')
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
                 without: Sequence[str] = (), waiting_for: Collection[str] = ()) -> list[SpooledObject]:  # fmt: skip
@@ -189,14 +174,6 @@ class Spool:
                 found.append(spooled(row, path))
         return found
 
-    def has(self, bucket: str, key: str) -> bool:
-        """Whether the key is taken. Waits for no commit; raises sqlite3.Error."""
-        return self._connections.reading.objects.has(bucket, key)
-
-    def states(self, bucket: str, prefix: str) -> dict[str, State]:
-        """The states of all objects whose keys start with ``prefix``, by key. Waits for no commit; raises sqlite3.Error."""
-        return {row['key']: State(row['state']) for row in self._connections.reading.objects.with_prefix(bucket, prefix)}
-
     def gaps_after(self, version: int, limit: int, offsets: Mapping[str, int]) -> tuple[list[Gap], list[Watermark]]:
         """The changes of the gap journal since this version, and up to when it is complete, both at one instant.
 
@@ -206,14 +183,6 @@ class Spool:
         with self._connections.snapshot() as index:
             return index.gaps.changed(version, limit, offsets), index.gaps.watermarks()
 
-    def recordings(self) -> list[RecordingRows]:
-        """Bags of this robot that are not complete yet. Waits for no commit; raises sqlite3.Error."""
-        return self._connections.reading.recordings.rows(self.robot)
-
-    def has_room(self) -> bool:
-        """Whether a bag may continue: enough space must be left to spool what it has already written."""
-        return self._tree.free_bytes() >= self._settings.min_free_bytes // 2
-
     def carry(self, sink: str) -> None:
         """Take over the messages of a sink that this robot's earlier sessions left open. Call it once, before the sink counts."""
         with self._connections.lock:
@@ -222,10 +191,6 @@ class Spool:
                 with index.transaction():
                     rows = carry(index, self._session.number, self.robot, sink)
                 self.accounts.carried.take_over(rows)
-
-    def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
-        """Objects without a final name for this reason, oldest first; waits for no commit. Raises sqlite3.Error."""
-        return self._connections.reading.objects.held(reason, limit)
 
     def bind(self, bindings: Sequence[Binding]) -> list[SpooledObject]:
         """Give held objects their final, unique keys, all or none; returns those that may be shipped now.
@@ -239,24 +204,14 @@ class Spool:
         """How many objects wait for delivery; waits for no commit. Raises sqlite3.Error."""
         return sum(row[2] for row in self._connections.reading.overview.tally() if row[1] == State.PENDING.value)
 
-    def has_uncataloged(self) -> bool:
-        """Whether a delivered object is not in the catalog yet; waits for no commit. Raises sqlite3.Error."""
-        return bool(self._connections.reading.catalog.uncataloged(1))
-
     def usage(self) -> SpoolStatus:
         """What the spool contains now; waits for no commit. Raises OSError or sqlite3.Error."""
-        return self._connections.reading.usage(self._clock.wall_ns())
+        return self.reading.usage(self._clock.wall_ns())
 
     @contextmanager
     def drain_lock(self) -> Iterator[bool]:
         """The lock of the one process that ships; yields False if another process has it."""
         with flock(self.root / 'drain.lock', wait=False) as mine:
-            yield mine
-
-    @contextmanager
-    def node_lock(self) -> Iterator[bool]:
-        """The lock of the one node that takes this robot's messages; a second one would count and store them again."""
-        with flock(self.root / f'node-{self.robot}.lock', wait=False) as mine:
             yield mine
 
     def _end(self, session: Session) -> None:
@@ -270,7 +225,7 @@ class Spool:
     def _open(self) -> None:
         try:
             self._tree.create()
-            self._wait_for_index()
+            _wait_for_index(self.root)
             with flock(self.root / 'recovery.lock'):
                 self._connections.writing = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._connections.reading.open()
@@ -282,28 +237,21 @@ class Spool:
             self._connections.reading.close()
             raise
 
-    def _wait_for_index(self) -> None:
-        """Wait until a running process, under which the index was deleted, restores it with its next commit."""
-        end_s, sessions = time.monotonic() + PUT_BACK_S, SessionFiles(self.root)
-        while not (self.root / 'index.db').exists() and sessions.is_any_running() and time.monotonic() < end_s:
-            time.sleep(PUT_BACK_S / 50)
-
     def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome],
                 rows: Sequence[RecordingRows]) -> list[SpooledObject]:  # fmt: skip
         now_ns = self._clock.wall_ns()
         leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
-        room = make_room(self._connections.writing, self._tree, self._settings, self._keep, objects, leaving, now_ns)
-        self.shortage.note(room, now_ns)
+        not_stored = self.room.make(self._connections.writing, objects, leaving, now_ns)
         stored = _count(objects)
         snapshot = self.accounts.snapshot(stored)
         session = self._connections.session
         with closing(NewObjects(self._connections.writing, self._tree, self._repeats, session, now_ns)) as new:
             try:
-                staged_objects = new.stage(objects, room.not_stored)
+                staged_objects = new.stage(objects, not_stored)
                 with self._connections.writing.transaction(undo=new.discard):
                     for number, item in enumerate(staged_objects):
                         if self._takes(item):
-                            new.add(item, fits=number not in room.not_stored)
+                            new.add(item, fits=number not in not_stored)
                     for outcome in outcomes:
                         self._connections.writing.states.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                     for each in rows:
@@ -343,6 +291,13 @@ class Spool:
         if not 0 <= now_ns - self._forgot_ns < 3600 * SECOND:
             done = self._connections.writing.history.forget(now_ns - round(self._settings.remember_days * DAY_NS))
             self._forgot_ns = now_ns if done else 0
+
+
+def _wait_for_index(root: Path) -> None:
+    """Wait until a running process, under which the index was deleted, restores it with its next commit."""
+    end_s, sessions = time.monotonic() + PUT_BACK_S, SessionFiles(root)
+    while not (root / 'index.db').exists() and sessions.is_any_running() and time.monotonic() < end_s:
+        time.sleep(PUT_BACK_S / 50)
 
 
 def _continued(index: Index, robot: str, clock: Clock) -> Accounts:

@@ -76,7 +76,8 @@ class UnsyncedObjects:
         """
         if self._watch.poll() or not self._record.knows(self._watch.boot_id, self._watch.offset_ns()):
             self._record.note(self._watch)
-        bindings = [binding for item in self._spool.held(CLOCK, STEP) if (binding := self._binding(item)) is not None]
+        held = self._spool.reading.objects.held(CLOCK, STEP)
+        bindings = [binding for item in held if (binding := self._binding(item)) is not None]
         if not bindings:
             return []
         bound = self._spool.bind(bindings)

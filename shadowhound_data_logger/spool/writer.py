@@ -22,6 +22,7 @@ from typing import Final, NamedTuple
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.spool.ballast import unwritable
 from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
 
 COMMIT_S: Final = 0.1
@@ -181,7 +182,7 @@ class SpoolWriter:
                     self.spool.accounts.unsettle()
                 self._commit(*group)
         except (OSError, sqlite3.OperationalError) as error:
-            raise self.spool.unwritable(error) from error
+            raise unwritable(self.spool.root, error) from error
         except sqlite3.DatabaseError:
             self.set_damaged()
             raise
@@ -222,7 +223,7 @@ class SpoolWriter:
         those that must be written.
         """
         objects = [item for unit in units for item in unit.objects]
-        if not objects or self.spool.fits(objects):
+        if not objects or self.spool.room.fits(objects):
             first, *more = list(_split(units)) or [[]]
             return [(first, outcomes), *((part, []) for part in more)]
         files = [unit for unit in units if all(isinstance(item.body, FileBody) for item in unit.objects)]
@@ -232,7 +233,7 @@ class SpoolWriter:
 
     def _commit(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> None:
         objects, rows = [item for unit in units for item in unit.objects], [each for unit in units for each in unit.rows]
-        if self._leaving and self.spool.is_short(objects):
+        if self._leaving and self.spool.room.is_short(objects):
             self._remove_files()
         spooled = self.spool.commit(objects, outcomes, rows, leave_files=True)
         self._leaving.extend(outcome for outcome in outcomes if outcome.state is not State.QUARANTINED)

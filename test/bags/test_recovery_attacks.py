@@ -103,4 +103,4 @@ def test_a_row_without_folder(tmp_path: Path) -> None:
         is_whole(it)
         said = manifest(it.objects(), name)
         assert (said['state'], [one['messages'] for one in said['slices']]) == ('recovered', [10])
-        assert it.spool.recordings() == []
+        assert it.spool.reading.recordings.rows('thor') == []

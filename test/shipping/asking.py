@@ -110,7 +110,9 @@ class Desk:
         for _ in range(60):
             self.step()
             self.deliver()
-            if not self.spool.requests.released()[0] and not any(row.is_open for row in self.spool.requests.rows()):
+            if not self.spool.reading.requested.released()[0] and not any(
+                row.is_open for row in self.spool.reading.requests.rows()
+            ):
                 break
         self.step()
 

@@ -174,7 +174,7 @@ def test_a_slice_that_cannot_be_cut_is_sent_completely(desk: Desk, damage: str) 
     desk.step()
     desk.step()
     assert [item.key.rpartition('/')[2] for item in desk.released] == [f'{BAG}_1.mcap']
-    assert {row.id: row.objects for row in desk.spool.requests.rows()} == {request: 1}
+    assert {row.id: row.objects for row in desk.spool.reading.requests.rows()} == {request: 1}
 
 
 def test_a_request_that_is_taken_back_ends_its_cut(desk: Desk) -> None:

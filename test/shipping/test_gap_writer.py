@@ -191,7 +191,8 @@ def test_a_full_disk_keeps_the_parts(root: Path) -> None:
     spool.commit([make('a')])
     (part,) = spool.commit([part for part in catalog.parts() if '/_gaps/' in part.key])
     spool.commit([make('b', priority=0)])
-    assert spool.states('sensor-data', '') == {'a': State.EVICTED, 'b': State.EVICTED, part.key: State.PENDING}
+    rows = spool.reading.objects.with_prefix('sensor-data', '')
+    assert {row['key']: State(row['state']) for row in rows} == {'a': State.EVICTED, 'b': State.EVICTED, part.key: State.PENDING}
     spool.close()
 
 

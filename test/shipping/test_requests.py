@@ -61,7 +61,7 @@ def test_asking_twice_is_asking_once(desk: Desk) -> None:
     desk.step()
     desk.step()
     assert len(desk.answers(first)) == before
-    assert len(desk.spool.requests.rows()) == 1
+    assert len(desk.spool.reading.requests.rows()) == 1
 
 
 @pytest.mark.parametrize(('want', 'numbers'), [
@@ -127,7 +127,7 @@ def test_protected_alone_beyond_the_limit_ends_keeping(tmp_path: Path) -> None:
         desk.keeps(*(frame(number, body=bytes([number]) * (300 << 10), protected=True) for number in range(4)))
         desk.keeps(frame(9, body=b'9' * 100_000))
         assert [desk.state(number) for number in (0, 1, 2, 3, 9)] == ['kept'] * 4 + ['evicted']
-        assert desk.spool.shortage.unkept == 1
+        assert desk.spool.room.unkept == 1
         assert_whole(desk.root)
 
 
@@ -244,14 +244,14 @@ def test_a_kill_during_acceptance_leaves_no_partial_request(tmp_path: Path, monk
         request = desk.ask(sensor='camera')
         with pytest.raises(OSError, match='it died'):
             desk.step()
-        assert desk.spool.requests.rows() == []
-        assert len(desk.spool.requests.unreleased(request, 100)) == 8
+        assert desk.spool.reading.requests.rows() == []
+        assert len(desk.spool.reading.requested.unreleased(request, 100)) == 8
     desk.entries.clear()
     desk.write(encode_inbox([]))  # the requester took it out again
     desk.open()
     with closing(desk.spool):
         desk.step()
-        assert desk.spool.requests.unreleased(request, 100) == []
+        assert desk.spool.reading.requested.unreleased(request, 100) == []
         request = desk.ask(sensor='camera')
         desk.finish()
         assert desk.answers(request)[-1]['outcomes'] == {'delivered': {'objects': 10, 'bytes': 60}}
@@ -328,7 +328,7 @@ def test_many_requests_are_remembered_and_the_first_ones_forgotten(desk: Desk, m
         desk.deliver()
         desk.step()
         desk.deliver()
-    assert len(desk.spool.requests.rows()) <= 4
+    assert len(desk.spool.reading.requests.rows()) <= 4
     desk.ask(by='other', sensor='camera')
     desk.finish()
     assert desk.state(1) == 'delivered'

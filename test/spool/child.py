@@ -112,7 +112,8 @@ def bind(root: Path, moment: str) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
     setattr(owner, step, to_the_end if moment == 'synced' else lambda *_: os.kill(os.getpid(), signal.SIGKILL))
-    spool.bind([Binding(item.id, f'thor/final/{item.key[-1]}', {'bound': 'yes'}, 5, 6) for item in spool.held('clock')])
+    held = spool.reading.objects.held('clock')
+    spool.bind([Binding(item.id, f'thor/final/{item.key[-1]}', {'bound': 'yes'}, 5, 6) for item in held])
 
 
 VERBS: dict[str, Callable[..., None]] = {'hold': hold, 'add': add, 'load': load, 'die': die, 'bind': bind}

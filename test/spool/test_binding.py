@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ HELD = f'held/clock/{BUCKET}'
 def hold(spool: Spool, *names: str, **fields: Any) -> list[Binding]:
     """Spool held objects; returns what they are to become."""
     put(spool, *(make(f'thor/provisional/{name}', name.encode(), **{'held': 'clock', **fields}) for name in names))
-    return [final(item.id, item.key.rpartition('/')[2]) for item in spool.held('clock')]
+    return [final(item.id, item.key.rpartition('/')[2]) for item in spool.reading.objects.held('clock')]
 
 
 def final(number: int, name: str) -> Binding:
@@ -36,10 +37,10 @@ def test_held_objects_are_listed_oldest_first(spool: Spool) -> None:
     """Those of one reason, as many as are asked for, with all that a binding is made from."""
     put(spool, *(make(f'k/{name}', held='clock', metadata={'name': name}) for name in 'cab'))
     put(spool, make('k/other', held='mission-7'), make('k/free'))
-    one, two = spool.held('clock', 2)
+    one, two = spool.reading.objects.held('clock', 2)
     assert [one.key, two.key] == ['k/c', 'k/a']
     assert (one.bucket, one.metadata['name'], one.t_start_ns, one.t_end_ns, one.created_ns) == (BUCKET, 'c', *[NOON_NS] * 3)
-    assert [item.key for item in spool.held('mission-7')] == ['k/other']
+    assert [item.key for item in spool.reading.objects.held('mission-7')] == ['k/other']
 
 
 def test_a_bound_object_is_pending_under_its_final_name(spool: Spool, root: Path) -> None:
@@ -54,7 +55,7 @@ def test_a_bound_object_is_pending_under_its_final_name(spool: Spool, root: Path
     for found in (row, said):
         assert (found['key'], found['t_start_ns'], found['t_end_ns']) == (item.key, NOON_NS + 5, NOON_NS + 6)
     assert (said['held'], said['metadata']) == (None, item.metadata)
-    assert spool.held('clock') == []
+    assert spool.reading.objects.held('clock') == []
     assert assert_whole(root)['objects']['pending'] == 1
 
 
@@ -90,13 +91,13 @@ def test_final_names_are_unique(spool: Spool) -> None:
 def test_a_name_that_was_given_out_often_is_found_in_few_questions(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     """In turn, without a gap: an agent that numbers none of its frames must not keep the index from others."""
     asked: list[str] = []
-    has = ObjectTable.has
+    row = ObjectTable.row
 
-    def counting(table: ObjectTable, bucket: str, key: str) -> bool:
+    def counting(table: ObjectTable, bucket: str, key: str) -> sqlite3.Row | None:
         asked.append(key)
-        return has(table, bucket, key)
+        return row(table, bucket, key)
 
-    monkeypatch.setattr(ObjectTable, 'has', counting)
+    monkeypatch.setattr(ObjectTable, 'row', counting)
     keys = [item.key for item in put(spool, *(make('thor/a.jpg', b'%d' % number) for number in range(300)))]
     assert keys == ['thor/a.jpg', *(f'thor/a_{number}.jpg' for number in range(1, 300))]
     assert len(asked) < 300 * 20
@@ -148,7 +149,7 @@ def test_a_missing_file_does_not_block_others(spool: Spool, root: Path) -> None:
     bindings = hold(spool, 'a', 'b')
     (root / HELD / 'thor/provisional/a').unlink()
     assert [item.path.exists() for item in spool.bind(bindings)] == [False, True]
-    assert spool.held('clock') == []
+    assert spool.reading.objects.held('clock') == []
 
 
 def test_waiting_time_starts_once_the_clock_is_set(spool: Spool, root: Path, clock: FakeClock) -> None:
@@ -180,7 +181,7 @@ def test_killed_between_two_steps(opened: Open, root: Path, moment: str, state: 
         assert row['t_start_ns'] == (NOON_NS if state == 'held' else 5)
         assert ('bound' in row['metadata']) is (state == 'pending')
     assert_whole(root)
-    spool.bind([final(item.id, item.key[-1]) for item in spool.held('clock')])
+    spool.bind([final(item.id, item.key[-1]) for item in spool.reading.objects.held('clock')])
     assert {item.key for item in spool.pending(9)} == {'thor/final/a', 'thor/final/b'}
 
 
@@ -195,7 +196,7 @@ def test_death_at_any_moment_of_a_binding(root: Path, moments: Moments) -> None:
     def work() -> None:
         spool = new_spool(root)
         spool.open()
-        spool.bind([final(item.id, item.key[-1]) for item in spool.held('clock')])
+        spool.bind([final(item.id, item.key[-1]) for item in spool.reading.objects.held('clock')])
         spool.close()
 
     seen = []
@@ -210,7 +211,7 @@ def test_death_at_any_moment_of_a_binding(root: Path, moments: Moments) -> None:
             place = f'{READY}/thor/final/{row["key"][-1]}' if bound[0] else f'{HELD}/thor/provisional/{row["key"][-1]}'
             said = description_of(copy / place)
             assert (said['key'], said['t_start_ns'], said['held']) == (row['key'], row['t_start_ns'], row['reason'])
-        spool.bind([final(item.id, item.key[-1]) for item in spool.held('clock')])
+        spool.bind([final(item.id, item.key[-1]) for item in spool.reading.objects.held('clock')])
         for item in spool.pending(9):
             assert item.path.read_bytes() == item.key[-1].encode()
             settle(spool, item, State.DELIVERED)
@@ -258,6 +259,6 @@ def test_what_is_held_is_found_without_looking_at_the_rest(spool: Spool) -> None
     """A hundred thousand delivered objects cost it nothing."""
     asked: list[str] = []
     spool._connections.reading._db.set_trace_callback(asked.append)
-    spool.held('clock')
+    spool.reading.objects.held('clock')
     plan = spool._connections.writing._db.execute(f'EXPLAIN QUERY PLAN {asked[0]}').fetchall()
     assert [row[3] for row in plan] == ['SEARCH objects USING INDEX held (reason=?)']

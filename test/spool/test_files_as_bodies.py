@@ -123,7 +123,7 @@ def test_a_removed_source_is_missing(spool: Spool, root: Path, source: Path) -> 
     assert {row['key']: (row['state'], row['reason']) for row in rows(root)} == {
         KEY: ('quarantined', 'missing'), 'thor/other.jpg': ('pending', None)}  # fmt: skip
     assert_whole(root)
-    assert not spool.knows(BUCKET, KEY, SHA256)
+    assert not spool.reading.objects.knows(BUCKET, KEY, SHA256)
 
 
 def test_a_file_without_room_is_given_up(opened: Open, root: Path, source: Path) -> None:
@@ -148,15 +148,15 @@ def test_a_linked_file_needs_no_free_space(opened: Open, root: Path, source: Pat
 
 def test_known_content(spool: Spool, source: Path) -> None:
     """The spool knows what it was given under a key, also when that got a number, and also after delivery."""
-    assert not spool.knows(BUCKET, KEY, SHA256)
+    assert not spool.reading.objects.knows(BUCKET, KEY, SHA256)
     put(spool, make(KEY, b'a foreign writer'))
-    assert not spool.knows(BUCKET, KEY, SHA256)
+    assert not spool.reading.objects.knows(BUCKET, KEY, SHA256)
     (item,) = put(spool, sliced(source))
     assert item.key.endswith('_1.mcap')
-    assert spool.knows(BUCKET, KEY, SHA256)
-    assert not spool.knows('trajectories', KEY, SHA256)
+    assert spool.reading.objects.knows(BUCKET, KEY, SHA256)
+    assert not spool.reading.objects.knows('trajectories', KEY, SHA256)
     settle(spool, item, State.DELIVERED)
-    assert spool.knows(BUCKET, KEY, SHA256)
+    assert spool.reading.objects.knows(BUCKET, KEY, SHA256)
 
 
 def test_death_at_any_moment_of_taking_a_file(tmp_path: Path, root: Path, moments: Moments) -> None:
@@ -178,7 +178,7 @@ def test_death_at_any_moment_of_taking_a_file(tmp_path: Path, root: Path, moment
         spool = new_spool(copy)
         spool.open()
         assert_whole(copy)
-        known = spool.knows(BUCKET, KEY, SHA256)
+        known = spool.reading.objects.knows(BUCKET, KEY, SHA256)
         assert not (copy / 'incoming').exists() or not list((copy / 'incoming').iterdir())
         seen.add((has_source, known))
         spool.close()

@@ -18,6 +18,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.spool.account_table import AccountTable
+from shadowhound_data_logger.spool.ballast import unwritable
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.object_table import ObjectStates
 from shadowhound_data_logger.spool.spool import Spool
@@ -183,7 +184,7 @@ def test_a_payload_that_cannot_be_written(spool: Spool, root: Path, monkeypatch:
 def test_a_full_disk_has_one_name(spool: Spool) -> None:
     """Whether the index or a file found it: a log that tells each new error once tells one."""
     errors = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), sqlite3.OperationalError('database or disk is full')
-    (told,) = {str(spool.unwritable(error)) for error in errors}
+    (told,) = {str(unwritable(spool.root, error)) for error in errors}
     assert 'No space left on device' in told
 
 

@@ -77,11 +77,12 @@ def test_what_a_key_needs_stays_known(opened: Open, spool: Spool, root: Path) ->
     age(spool)
     assert assert_whole(root) == before
     key, sha256 = frame(1).key, content_sha256(frame(1).body)
-    assert spool.has(BUCKET, key)
-    assert not spool.has('trajectories', key)
-    assert spool.knows(BUCKET, key, sha256)
-    assert not spool.knows(BUCKET, key, '0' * 64)
-    assert spool.states(BUCKET, 'thor/rosbags/bag_a/') == {
+    objects = spool.reading.objects
+    assert objects.row(BUCKET, key)
+    assert not objects.row('trajectories', key)
+    assert objects.knows(BUCKET, key, sha256)
+    assert not objects.knows(BUCKET, key, '0' * 64)
+    assert {row['key']: State(row['state']) for row in objects.with_prefix(BUCKET, 'thor/rosbags/bag_a/')} == {
         'thor/rosbags/bag_a/bag_a_0.mcap': State.DELIVERED, 'thor/rosbags/bag_a/bag_a_1.mcap': State.EVICTED,
     }  # fmt: skip
     (again,) = put(spool, replace(frame(1), body=b'other'))

@@ -90,10 +90,10 @@ def test_recordings_are_kept_by_owner(root: Path) -> None:
     node.commit(rows=[RecordingRows('a', '{}', '[]'), one, one, replace(one, folder='b')])
     by_hand.commit(rows=[replace(one, said='{"by": "hand"}')])
     node.commit(rows=[RecordingRows('b', is_whole=True)])
-    assert node.recordings() == [one]
-    assert by_hand.recordings() == [replace(one, said='{"by": "hand"}')]
+    assert node.reading.recordings.rows(node.robot) == [one]
+    assert by_hand.reading.recordings.rows(by_hand.robot) == [replace(one, said='{"by": "hand"}')]
     node.commit(rows=[RecordingRows('a', is_whole=True)])
-    assert (node.recordings(), len(by_hand.recordings())) == ([], 1)
+    assert (node.reading.recordings.rows(node.robot), len(by_hand.reading.recordings.rows(by_hand.robot))) == ([], 1)
     node.close()
     by_hand.close()
 
@@ -105,6 +105,6 @@ def test_a_slice_and_its_row_are_one_transaction(opened: Open, monkeypatch: pyte
         patch.setattr(RecordingTable, 'write', Mock(side_effect=sqlite3.OperationalError('disk I/O error')))
         with pytest.raises(sqlite3.OperationalError):
             spool.commit([make('one')], rows=[RecordingRows('a', '{}', '[]', (SLICE,))])
-    assert (spool.pending(1), spool.recordings()) == ([], [])
+    assert (spool.pending(1), spool.reading.recordings.rows('thor')) == ([], [])
     spool.commit([make('one')], rows=[RecordingRows('a', '{}', '[]', (SLICE,))])
-    assert (len(spool.pending(1)), len(spool.recordings())) == (1, 1)
+    assert (len(spool.pending(1)), len(spool.reading.recordings.rows('thor'))) == (1, 1)

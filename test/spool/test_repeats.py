@@ -72,7 +72,7 @@ def test_delivered_content_counts_and_lost_content_does_not(opened: Open, root: 
 def test_what_has_no_date_yet_is_no_repeat(spool: Spool) -> None:
     """Its key is a provisional one, so nothing can name it."""
     put(spool, picture(0, held='clock'), picture(1, held='clock'))
-    assert len(spool.held('clock')) == 2
+    assert len(spool.reading.objects.held('clock')) == 2
     assert len(put(spool, picture(2))) == 1
 
 

@@ -194,7 +194,7 @@ def test_a_changed_key_pattern(started: Callable[..., Run], pattern: str, clocks
     """A name that cannot be one does not stop the others: it goes without a date, or under what is left of its pattern."""
     run = started()
     run.take({}, {'key_pattern': 'x'})
-    one = run.spool.held('clock')[0]
+    one = run.spool.reading.objects.held('clock')[0]
     broken = {**one.metadata, 'key_pattern': pattern}
     run.spool._connections.writing._db.execute('UPDATE objects SET metadata = ? WHERE id = ?', (json.dumps(broken), one.id))
     clocks.set()

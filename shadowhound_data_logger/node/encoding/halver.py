@@ -22,7 +22,7 @@ from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_me
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.shipping.thinning import may_halve, span_of
-from shadowhound_data_logger.spool.thinning import ThinnableObject, Thinned
+from shadowhound_data_logger.spool.kept_objects import ThinnableObject, Thinned
 
 _PACK: Final = {'application/zip': pack_zip, 'application/x-tar': pack_tar}
 _ALWAYS: Final = 1 << 63

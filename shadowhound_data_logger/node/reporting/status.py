@@ -130,7 +130,7 @@ class Status:
         """The current status; None if the spool cannot be read, which is logged once."""
         now_s, stages = self._monotonic(), self._stages
         try:
-            spool = stages.spool.usage()
+            spool = stages.spool.reading.usage(self._clock.wall_ns())
         except (OSError, sqlite3.Error) as error:
             self._complain(f'the status cannot be gathered: {error}')
             return None
@@ -143,7 +143,7 @@ class Status:
             paused=stages.intake.paused, ended=ended, not_logged=dict(stages.intake.not_logged),
             middleware=self._middleware(now_s), mission=stages.mission.status(), bag=self._bag(), events=self._events(),
             topics=self._topics(now_s), queue=stages.queue.status(),
-            spool=replace(spool, evicted=stages.spool.shortage.evicted, unkept=stages.spool.shortage.unkept,
+            spool=replace(spool, evicted=stages.spool.room.evicted, unkept=stages.spool.room.unkept,
                           max_bytes=limits.max_bytes,
                           min_free_bytes=limits.min_free_bytes, remember_days=limits.remember_days),
             store=self._store(upload, now_s, spool.bytes),
