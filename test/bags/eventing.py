@@ -46,7 +46,7 @@ class Buffer:
 
     @property
     def room(self) -> list[bool]:
-        return self.spool.room
+        return self.spool.has_room
 
     @property
     def root(self) -> Path:

@@ -58,10 +58,8 @@ class BoundedSpool(Spool):
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
-        self.room = [True]
-
-    def has_room(self) -> bool:
-        return self.room[0]
+        self.has_room = [True]
+        self.room.has_for_bags = lambda: self.has_room[0]  # type: ignore[method-assign]
 
 
 @dataclass(slots=True)
@@ -77,7 +75,7 @@ class Desk:
 
     @property
     def room(self) -> list[bool]:
-        return self.spool.room
+        return self.spool.has_room
 
     @property
     def root(self) -> Path:

@@ -93,6 +93,8 @@ class Consumer(Protocol):
     """Whether it receives them as soon as the intake is open, or only after ``Intake.listen``."""
     wants_latched: bool = False
     """Whether it starts with what latched publishers sent before, through separate subscriptions."""
+    left_out: int = 0
+    """Number of topics that match its expression but are skipped, because there are too many. Set by the intake."""
     failures: int = 0
     """Number of failures to take messages."""
     last_error: str = ''

@@ -54,8 +54,6 @@ class ExtraTopics:
         self._free: frozenset[str] = frozenset()
         self._ever: set[str] = set()
         self._unpublished_since_s: dict[str, float] = {}
-        self.left_out = 0
-        """Number of topics that match an expression but are skipped, because there are too many."""
 
     @property
     def own(self) -> Collection[Subscriber]:
@@ -103,12 +101,12 @@ class ExtraTopics:
                 yield topic
             else:
                 left_out += 1
-        if left_out and not self.left_out:
+        if left_out and not self.consumer.left_out:
             text = (
                 '%d topics (%s, ...) are not recorded: besides those in the settings, at most %d are at a time, and %d in total'
             )
             log.warning(text, left_out, printable(found[-1]), MAX_FOUND, MAX_EVER)
-        self.left_out = left_out
+        self.consumer.left_out = left_out
 
     def _drop_abandoned(self, now_s: float) -> None:
         """Close the subscriptions of topics that have had no publisher for a while, unless the settings name them."""
@@ -129,7 +127,7 @@ class ExtraTopics:
         """Take what still waits; later messages are not passed to the consumer."""
         own, self._own = self._own, {}
         self._unpublished_since_s.clear()
-        self.left_out = 0
+        self.consumer.left_out = 0
         with ExitStack() as ending:
             for subscriber in own.values():
                 ending.callback(subscriber.close, now_s)

@@ -53,8 +53,8 @@ class Intake:
         subscriptions that exist already.
         """
         self._sensors = sensors
-        self._consumers = consumers
-        self._found = found
+        self.consumers = consumers
+        self.found = found
         self._early = early
         self._context = context = Dependencies(node, early.group if early else PolledGroup(), accounts, types, stamps, early)
         self._others = OtherTypes(node, accounts)
@@ -66,8 +66,7 @@ class Intake:
         self._extra = [ExtraTopics(context, consumers[place:], named)
                        for place, consumer in enumerate(consumers) if consumer.wanted_topics is not None]  # fmt: skip
         self._listening = [extra for extra in self._extra if extra.consumer.from_start]
-        self._requests: deque[Callable[[], None]] = deque()
-        self._wake = threading.Event()
+        self._requests = _Requests()
         self._next_poll_s = self._next_refresh_s = 0.0
         self.paused = False
         """Whether messages are only counted; set by the thread."""
@@ -88,29 +87,11 @@ class Intake:
         """Subscribers to topics that no sensor has."""
         return [subscriber for extra in self._extra for subscriber in extra.own]
 
-    def consumer_failures(self) -> Mapping[str, tuple[int, str]]:
-        """For each consumer that failed to take messages: the count, and the newest error."""
-        return {type(each).__name__: (each.failures, each.last_error) for each in self._consumers if each.failures}
-
-    def left_out(self, consumer: Consumer) -> int:
-        """Number of topics that match a consumer's expression but are skipped, because there are too many."""
-        return next((extra.left_out for extra in self._extra if extra.consumer is consumer), 0)
-
-    @property
-    def not_logged(self) -> Mapping[str, str]:
-        """Topics that no sensor names and that are not logged, and why."""
-        return self._found.not_logged if self._found is not None else {}
-
-    @property
-    def is_of_another_robot(self) -> bool:
-        """Whether the robot is no Unitree, so that topics of the default sensors need not exist."""
-        return self._found is not None and self._found.is_of_another_robot
-
     def status(self) -> list[SubscriberStatus]:
         return [subscriber.status() for subscriber in self._subscribers]
 
     def open(self) -> None:
-        for consumer in self._consumers:
+        for consumer in self.consumers:
             if consumer.from_start:
                 consumer.begin()
         self.worker.start()
@@ -119,9 +100,9 @@ class Intake:
         """Take what waits, flush it to the consumers, close subscriptions and the thread; False if that failed or timed out."""
         if self.worker.stopping:
             return True
-        finished = self._call(self._finish, deadline_s)
+        finished = self._requests.call(self._finish, deadline_s)
         self.worker.stop()
-        self._wake.set()
+        self._requests.post(lambda: None)
         return self.worker.join(deadline_s) and finished
 
     def flush(self, deadline_s: float, then: Callable[[], None] | None = None) -> bool:
@@ -129,11 +110,17 @@ class Intake:
 
         ``then`` is called by the thread between earlier and later messages.
         """
-        return self._call(partial(self._flush, then), deadline_s)
+        return self._requests.call(partial(self._flush, then), deadline_s)
 
     def pause(self, deadline_s: float, *, paused: bool) -> bool:
         """From now on only count messages, or store them again; False if that failed or timed out."""
-        return self.flush(deadline_s, partial(self._set_paused, paused=paused))
+
+        def then() -> None:
+            self.paused = paused
+            for subscriber in (*self._subscribers, *self._unsampled):
+                subscriber.paused = paused
+
+        return self.flush(deadline_s, then)
 
     def listen(self, consumer: Consumer, on: bool, deadline_s: float) -> bool:
         """Start or stop passing messages to a consumer that selects topics; False if that failed or timed out.
@@ -141,18 +128,17 @@ class Intake:
         ``on`` while it is on already starts again: earlier messages are taken first.
         """
         extra = next(extra for extra in self._extra if extra.consumer is consumer)
-        return self._call(partial(self._listen, extra, on), deadline_s)
+        return self._requests.call(partial(self._listen, extra, on), deadline_s)
 
     def update(self, sensors: Iterable[SensorSettings]) -> None:
         """Apply these settings soon; sensors that are not among them stay unchanged."""
-        self._post(partial(self._update, tuple(sensors)))
+        self._requests.post(partial(self._update, tuple(sensors)))
 
     # -- on the thread ---------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
         """One round: wait for the next poll, follow the graph, drain every topic, handle requests."""
-        self._wake.wait(max(0.0, self._next_poll_s - time.monotonic()))
-        self._wake.clear()
+        self._requests.wait(self._next_poll_s - time.monotonic())
         now_s = time.monotonic()
         self._next_poll_s = now_s + until_poll(time.time())
         todo: list[Callable[[], None]] = []
@@ -166,18 +152,14 @@ class Intake:
         todo.append(self._others.drain)
         if refreshes and self._listening:
             todo.append(partial(self._follow, now_s))
-        todo += [partial(consumer.tick, now_s) for consumer in self._consumers]
-        _each([*todo, self._handle_requests])
-
-    def _handle_requests(self) -> None:
-        while self._requests:
-            self._requests.popleft()()
+        todo += [partial(consumer.tick, now_s) for consumer in self.consumers]
+        _each([*todo, self._requests.handle])
 
     def _find(self, now_s: float) -> None:
         """Add sensors for topics that the settings do not name; they are subscribed to at the next refresh."""
-        for sensor in self._found.poll(self._sensors, now_s) if self._found is not None else ():
+        for sensor in self.found.poll(self._sensors, now_s) if self.found is not None else ():
             self._sensors[sensor.name] = sensor
-            subscriber = Subscriber(self._context, sensor, self._consumers, self._others)
+            subscriber = Subscriber(self._context, sensor, self.consumers, self._others)
             subscriber.paused = self.paused
             self._subscribers = (*self._subscribers, subscriber)
             self._by_turn = self._in_turn()
@@ -190,12 +172,7 @@ class Intake:
 
     def _flush(self, then: Callable[[], None] | None = None) -> None:
         steps: list[Callable[[], None]] = [partial(self._drain, time.monotonic())]
-        _each([*steps, *(consumer.flush for consumer in self._consumers), *([then] if then is not None else [])])
-
-    def _set_paused(self, *, paused: bool) -> None:
-        self.paused = paused
-        for subscriber in (*self._subscribers, *self._unsampled):
-            subscriber.paused = paused
+        _each([*steps, *(consumer.flush for consumer in self.consumers), *([then] if then is not None else [])])
 
     def _update(self, sensors: Sequence[SensorSettings]) -> None:
         now_s = time.monotonic()
@@ -228,15 +205,21 @@ class Intake:
         now_s = time.monotonic()
         ends = [partial(subscriber.close, now_s) for subscriber in self._subscribers]
         ends += [partial(extra.end, now_s) for extra in self._extra]
-        _each([*ends, *(consumer.flush for consumer in self._consumers), self._others.close, self.worker.stop])
+        _each([*ends, *(consumer.flush for consumer in self.consumers), self._others.close, self.worker.stop])
 
-    # -- between the threads ---------------------------------------------------------------------------------------
 
-    def _post(self, request: Callable[[], None]) -> None:
-        self._requests.append(request)
+class _Requests:
+    """What other threads request of the intake, which handles it between two drains."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._wake = threading.Event()
+
+    def post(self, request: Callable[[], None]) -> None:
+        self._waiting.append(request)
         self._wake.set()
 
-    def _call(self, request: Callable[[], None], deadline_s: float) -> bool:
+    def call(self, request: Callable[[], None], deadline_s: float) -> bool:
         """Whether the thread did it in time and without a failure; if it takes longer, it still does it."""
         done = threading.Event()
         succeeded: list[bool] = []
@@ -248,8 +231,18 @@ class Intake:
             finally:
                 done.set()
 
-        self._post(answer)
+        self.post(answer)
         return done.wait(max(0.0, deadline_s)) and bool(succeeded)
+
+    def wait(self, seconds: float) -> None:
+        """On the thread: until a request waits, at most so long."""
+        self._wake.wait(max(0.0, seconds))
+        self._wake.clear()
+
+    def handle(self) -> None:
+        """On the thread."""
+        while self._waiting:
+            self._waiting.popleft()()
 
 
 def until_poll(wall_s: float) -> float:

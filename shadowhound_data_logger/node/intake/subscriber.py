@@ -157,6 +157,24 @@ class OtherTypes:
         return self._node
 
 
+class _Publishers:
+    """The publishers in the graph, without those whose node is known to have ended.
+
+    Fast DDS 2.6 ignores Cyclone DDS's notice that a publisher ended (a serialized key of more than 16 bytes,
+    MessageReceiver.cpp), and keeps it while the process runs; the node's graph information is reported separately.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._had_node: dict[str, set[str]] = {}
+
+    def of(self, topic: str) -> list[Endpoint]:
+        found = endpoints(self._node, topic)
+        before = self._had_node.get(topic, set())
+        known = self._had_node[topic] = {each.gid for each in found if each.node or each.gid in before}
+        return [each for each in found if each.node or each.gid not in known]
+
+
 class Dependencies(NamedTuple):
     """What subscribers need, the same for all of an intake."""
 
@@ -199,7 +217,7 @@ class Subscriber:
         self._retiring: dict[Reader, float] = {}
         self._received: set[Plan] = set()
         self._senders = Senders()
-        self._had_node: dict[str, set[str]] = {}
+        self._graph = _Publishers(node)
         self._stream: SensorStream | TopicStream | None = None
         self.paused = False
         """Whether messages are only counted."""
@@ -269,16 +287,14 @@ class Subscriber:
         elif sensor.enabled and not before.enabled:
             self._accounts.rebase(self._chosen)
 
-    def close(self, now_s: float) -> None:
-        """Take what still waits, and close the subscriptions."""
-        self._leave(now_s)
-
     # -- the graph -------------------------------------------------------------------------------------------------
 
     def _choose(self, now_s: float) -> list[Endpoint]:
         """Publishers of the chosen topic: the preferred one if published, another after a while without it."""
-        found = {topic: self._publishers_of(topic) for topic in self._topics}
-        present = {topic for topic, publishers in found.items() if self._has_named_type(topic, publishers)}
+        found = {topic: self._graph.of(topic) for topic in self._topics}
+        named = {topic: alternatives(name) for topic, name in self._types_expected.items() if name}
+        present = {topic for topic, publishers in found.items()
+                   if any(topic not in named or each.type in named[topic] for each in publishers)}  # fmt: skip
         best = next((topic for topic in self._topics if topic in present), self._chosen)
         if best == self._chosen or self._chosen in present:
             self._absent_since_s = None
@@ -292,22 +308,6 @@ class Subscriber:
             self._chosen = best
             self._absent_since_s = None
         return found[self._chosen]
-
-    def _publishers_of(self, topic: str) -> list[Endpoint]:
-        """The publishers in the graph, without those whose node is known to have ended.
-
-        Fast DDS 2.6 ignores Cyclone DDS's notice that a publisher ended (a serialized key of more than 16 bytes,
-        MessageReceiver.cpp), and keeps it while the process runs; the node's graph information is reported separately.
-        """
-        found = endpoints(self._node, topic)
-        before = self._had_node.get(topic, set())
-        known = self._had_node[topic] = {each.gid for each in found if each.node or each.gid in before}
-        return [each for each in found if each.node or each.gid not in known]
-
-    def _has_named_type(self, topic: str, publishers: Sequence[Endpoint]) -> bool:
-        """Whether the topic is published with the type that is named for it."""
-        named = self._types_expected.get(topic)
-        return any(not named or publisher.type in alternatives(named) for publisher in publishers)
 
     def _account_for_others(self, type_name: str, found: Sequence[Endpoint], now_s: float) -> None:
         """Account for other types of the topic; log each once."""
@@ -368,7 +368,7 @@ class Subscriber:
 
     def _retype(self, type_name: str, now_s: float) -> None:
         """Start with a topic that is new, or has another type than before."""
-        self._leave(now_s)
+        self.close(now_s)
         if self._others is None:
             self._stream = TopicStream(self._chosen, type_name, self._message_types, self._stamps, self._consumers)
         else:
@@ -394,13 +394,13 @@ class Subscriber:
 
     def _abandon(self, now_s: float) -> None:
         """Leave the topic on purpose: later messages do not count as lost."""
-        self._leave(now_s)
+        self.close(now_s)
         if self._others is not None:
             self._others.follow(self._chosen, ())
         self._accounts.rebase(self._chosen)
 
-    def _leave(self, now_s: float) -> None:
-        """Close everything for the current topic and type, each even if another fails."""
+    def close(self, now_s: float) -> None:
+        """Take what still waits and close everything for the current topic and type, each even if another fails."""
         with ExitStack() as leaving:
             leaving.callback(self._forget)
             for reader in self._readers:
@@ -429,7 +429,7 @@ class Subscriber:
         self._last_received_s = now_s - _waited_s(taken[-1].received_ns, since_s)
         is_unnamed = taken[0].publisher is None or taken[0].number is None
         if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):
-            gids = [each.gid for each in self._publishers_of(self._chosen) if each.type == self._type]
+            gids = [each.gid for each in self._graph.of(self._chosen) if each.type == self._type]
             self._senders.poll(gids, now_s)
         self._stream.add(taken, self._senders, now_s, paused=self.paused)
 

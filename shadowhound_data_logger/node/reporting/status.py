@@ -137,10 +137,11 @@ class Status:
         while self._past and self._past[0][0] < now_s - WINDOW_S:
             self._past.popleft()
         boot_ns, upload, limits = self._clock.boot_ns(), stages.uploader.status(), self._settings.spool
+        not_logged = {} if stages.intake.found is None else dict(stages.intake.found.not_logged)
         status = NodeStatus(
             robot=self._settings.robot, version=self.version, pid=os.getpid(), boot_id=self._clock.boot_id, boot_ns=boot_ns,
             time=iso(self._clock.wall_ns()), uptime_s=round((boot_ns - self._began_ns) / SECOND, 1),
-            paused=stages.intake.paused, ended=ended, not_logged=dict(stages.intake.not_logged),
+            paused=stages.intake.paused, ended=ended, not_logged=not_logged,
             middleware=self._middleware(now_s), mission=stages.mission.status(), bag=self._bag(), events=self._events(),
             topics=self._topics(now_s), queue=stages.queue.status(),
             spool=replace(spool, evicted=stages.spool.room.evicted, unkept=stages.spool.room.unkept,
@@ -149,7 +150,8 @@ class Status:
             store=self._store(upload, now_s, spool.bytes),
             requests=stages.requests.status if stages.requests is not None else RequestStatus(),
             clock=self._clock.state(),
-            consumers={name: ConsumerStatus(*found) for name, found in stages.intake.consumer_failures().items()},
+            consumers={type(each).__name__: ConsumerStatus(each.failures, each.last_error)
+                       for each in stages.intake.consumers if each.failures},
             workers={worker.name: worker.status() for worker in stages.workers},
         )  # fmt: skip
         status = replace(status, stalls=self._watchdog.poll(status, now_s))
@@ -176,7 +178,8 @@ class Status:
         sources = {source.topic: source for source in self._stages.intake.status()}
         topics = dict.fromkeys((*sources, *totals))
         rows = {topic: self._topic(topic, sources.get(topic), totals.get(topic, _NOTHING), now_s) for topic in topics}
-        if not self._stages.intake.is_of_another_robot:
+        found = self._stages.intake.found
+        if found is None or not found.is_of_another_robot:
             return rows
         return {topic: row for topic, row in rows.items() if row.publishers or row.received or not row.enabled}
 
@@ -206,11 +209,11 @@ class Status:
     def _bag(self) -> BagStatus:
         """The recording, with this session's messages by topic."""
         return replace(self._stages.recorder.status(), topics=self._stages.spool.accounts.totals(BAG),
-                       left_out=self._stages.intake.left_out(self._stages.bags))  # fmt: skip
+                       left_out=self._stages.bags.left_out)  # fmt: skip
 
     def _events(self) -> EventStatus:
         """Ring and events, with this session's event messages by topic."""
-        left_out = sum(self._stages.intake.left_out(each) for each in self._stages.event_buffer.consumers)
+        left_out = sum(each.left_out for each in self._stages.event_buffer.consumers)
         return replace(self._stages.event_buffer.events.status(), topics=self._stages.spool.accounts.totals(EVENT),
                        left_out=left_out)  # fmt: skip
 

@@ -97,7 +97,7 @@ def test_topics_that_no_setting_names_are_few(
     monkeypatch.setattr(module, 'MAX_FOUND', 3)
     crowd(robot, *(f'/crowd/{letter}' for letter in 'abcde'))
     with caplog.at_level(logging.WARNING):
-        recording.until(lambda found: len(found) == 3 and recording.extra.left_out == 2)
+        recording.until(lambda found: len(found) == 3 and recording.extra.consumer.left_out == 2)
         crowd(robot, '/named')
         assert recording.until(lambda found: '/named' in found and len(found) == 4)
         recording.poll()
@@ -112,7 +112,7 @@ def test_an_abandoned_topic_frees_its_place(robot: Node, recording: Recording, m
     (first,) = crowd(robot, '/crowd/a')
     recording.until(lambda found: found == {'/crowd/a'})
     crowd(robot, '/crowd/b')
-    recording.until(lambda _: recording.extra.left_out == 1)
+    recording.until(lambda _: recording.extra.consumer.left_out == 1)
     robot.destroy_publisher(first)
     recording.until(lambda found: not found)
     recording.poll(module.GONE_S + 1)
@@ -126,7 +126,7 @@ def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monke
     for name in ('/crowd/a', '/crowd/b', '/crowd/c'):
         (publisher,) = crowd(robot, name)
         if name == '/crowd/c':
-            recording.until(lambda _: recording.extra.left_out == 1)
+            recording.until(lambda _: recording.extra.consumer.left_out == 1)
         else:
             recording.until(lambda found, name=name: name in found)
             robot.destroy_publisher(publisher)

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -27,21 +28,21 @@ from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import file, read
 
 
+class Sampler:
+    """A consumer that failed."""
+
+    failures, last_error = 2, 'ValueError: x'
+
+
 class Intake:
     """Listens to one topic; ``sources`` is what it says of that."""
 
     def __init__(self) -> None:
         self.paused = False
         self.worker = Worker('intake', lambda: None)
-        self.not_logged = {'/led': 'no rule'}
-        self.is_of_another_robot = False
+        self.found = SimpleNamespace(not_logged={'/led': 'no rule'}, is_of_another_robot=False)
+        self.consumers = [Sampler()]
         self.sources = [SubscriberStatus('imu', '/imu', enabled=True, publishers=1, received_s=None)]
-
-    def left_out(self, _: object) -> int:
-        return 0
-
-    def consumer_failures(self) -> dict[str, tuple[int, str]]:
-        return {'Sampler': (2, 'ValueError: x')}
 
     def status(self) -> list[SubscriberStatus]:
         return self.sources
@@ -144,7 +145,7 @@ def test_topics_of_a_unitree_are_not_missed_on_another_robot(setting: Setting) -
     """A topic of a default sensor is listed there once it has a publisher; on a Unitree it is always listed."""
     setting.intake.sources.append(SubscriberStatus('lowstate', '/lowstate', enabled=True, publishers=0, received_s=None))
     assert list(setting.poll().topics) == ['/imu', '/lowstate']
-    setting.intake.is_of_another_robot = True
+    setting.intake.found.is_of_another_robot = True
     assert list(setting.poll().topics) == ['/imu']
     setting.intake.sources[-1] = replace(setting.intake.sources[-1], publishers=1)
     assert list(setting.poll().topics) == ['/imu', '/lowstate']
