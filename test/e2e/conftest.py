@@ -13,6 +13,7 @@ from e2e.processes import Processes
 from e2e.reading import Objects
 from e2e.session import Session
 from e2e.station import Station
+from live.conftest import browser  # noqa: F401 - a fixture
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.config import UploadSettings
