@@ -88,7 +88,7 @@ def conditions_of_fleet(rows: Iterable[Mapping[str, Any]], settings: AlertSettin
         yield Condition(robot, SILENT, is_silent, f'nothing from it arrived in the store for {_hours(settings.silent_s)}')
         yield _losses(robot, int(row['lost']), settings)
         yield Condition(robot, DISK, row['no_room'] > 0, 'it deleted objects today because its disk or spool was full')
-        yield _quarantine(robot, int(row['quarantined']))
+        yield _quarantine(robot, int(row['quarantined']), 'messages of today (UTC)')
 
 
 def conditions_of_robot(
@@ -99,7 +99,7 @@ def conditions_of_robot(
     yield Condition(robot, SILENT, figures.get('state') != RUNNING, 'its node is not running, or does not answer')
     yield _losses(robot, lost, settings)
     yield _disk(robot, spool)
-    yield _quarantine(robot, int(spool.get('quarantined') or 0))
+    yield _quarantine(robot, int(spool.get('quarantined') or 0), 'objects')
     try:
         bad = list(StateFile(policies).read().bad.items())[-MAX_POLICIES:]
     except DataLoggerError:
@@ -115,8 +115,8 @@ def _losses(robot: str, lost: int | None, settings: AlertSettings) -> Condition:
     return Condition(robot, LOST, lost > settings.lost, f'{text}: {lost:,}' if lost > settings.lost else text)
 
 
-def _quarantine(robot: str, count: int) -> Condition:
-    text = 'objects are in quarantine because the store refused them; "shadowhound-data spool list" on the robot shows the reason'
+def _quarantine(robot: str, count: int, what: str) -> Condition:
+    text = f'{what} are in quarantine because the store refused them; "shadowhound-data spool list" on the robot shows the reason'
     return Condition(robot, QUARANTINE, count > 0, f'{count:,} {text}' if count else text)
 
 
