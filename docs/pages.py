@@ -17,7 +17,6 @@ from shadowhound_data_logger.cli.main import SECTIONS as VERBS
 from shadowhound_data_logger.core.options import GIBI, GROUPS, MEBI, SensorSettings
 
 DOCS: Final = Path(__file__).parent
-COLUMNS: Final = ('parameter', 'default', 'allowed', '')
 HEAD: Final = """\
 # Parameters
 
@@ -29,7 +28,7 @@ None is required. Set them in a parameter file (`--ros-args --params-file my.yam
 [go2.yaml](../launch_configs/go2.yaml) has all parameters with the defaults for a Unitree Go2. With an unknown name
 or an invalid value the node exits with code 2 and says what is allowed.
 
-**Live** parameters can be changed while the node runs:
+Defaults are in parentheses after the name, what is allowed at the end. **Live** parameters can be changed while the node runs:
 
     shadowhound-data node set camera.rate_hz 5.0              # on the robot
     ros2 param set /sensor_logger_node camera.rate_hz 5.0     # with ROS, from anywhere
@@ -59,12 +58,8 @@ COMMANDS: Final = """\
 `shadowhound-data VERB --help` has all options of a verb, with examples. Most verbs print JSON with `--json`.
 Times are UTC: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
 
-An error names the verb, what is wrong, and on the next line what to do:
-
-    shadowhound-data bag info: there is no bag patrol of rover in the folder /home/hound/.shadowhound/store
-      -> the store has no bag of rover; --robot names another robot
-
-With `--json` an error is one line of JSON on standard error, and nothing is printed on standard output:
+An error names the verb, what is wrong, and on the next line what to do. With `--json` it is one line of JSON on standard error,
+and nothing is printed on standard output:
 
     {"error": "there is no sensor 'camra'", "remedy": "is it 'camera'?", "verb": "shadowhound-data query", "exit_code": 2}
 
@@ -200,14 +195,10 @@ ENVIRONMENT: Final = """
 ## Environment variables
 Secrets are read from the environment only: a ROS parameter is visible to everyone on the network.
 
-| variable | default | |
-|---|---|---|
 """
 OTHERS: Final = """
 Rarely needed:
 
-| variable | default | |
-|---|---|---|
 """
 USUAL: Final = {
     'AWS_ENDPOINT_URL',
@@ -309,13 +300,12 @@ def commands() -> str:
 
 
 def _verb(name: str, verb: click.Command) -> Iterator[str]:
-    """The section of a verb: a row for each verb below it, or its examples (at most three)."""
+    """The section of a verb: a line for each verb below it, or two examples."""
     yield f'\n### {name}\n{verb.get_short_help_str(1000)}\n\n'
     if isinstance(verb, click.Group):
-        yield _row('verb', '') + '|---|---|\n'
         yield from _rows((name,), verb)
     else:
-        yield from (f'    {line}\n' for line in _examples(verb)[:3])
+        yield from (f'    {line}\n' for line in _examples(verb)[:2])
 
 
 def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
@@ -324,7 +314,7 @@ def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
         if isinstance(verb, click.Group):
             yield from _rows(at, verb)
         else:
-            yield _row(f'`{" ".join(at)}`', verb.get_short_help_str(1000))
+            yield f'- `{" ".join(at)}`: {verb.get_short_help_str(1000)}\n'
 
 
 def _examples(verb: click.Command) -> list[str]:
@@ -336,8 +326,7 @@ def parameters() -> str:
     parts = [HEAD, EXAMPLE, '```\n']
     described = _described()
     for section in (*SECTIONS, ADVANCED):
-        parts += [f'\n## {section.title}\n', f'{section.text}\n\n', _row(*COLUMNS)]
-        parts += ['|---' * len(COLUMNS) + '|\n', *(described[name] for name in section.names)]
+        parts += [f'\n## {section.title}\n', f'{section.text}\n\n', *(described[name] for name in section.names)]
         if section is SECTIONS[-1]:
             parts += [ENVIRONMENT, *_variables(usual=True)]
     return ''.join((*parts, OTHERS, *_variables(usual=False)))
@@ -346,31 +335,33 @@ def parameters() -> str:
 def _variables(*, usual: bool) -> Iterator[str]:
     for name, default, text in (*VARIABLES, *OTHER_VARIABLES):
         if (name in USUAL) == usual:
-            yield _row(f'`{name}`', default, text)
+            yield _item(name, default, text)
+
+
+def _item(name: str, default: str, text: str) -> str:
+    return f'- `{name}`{f" ({default})" if default else ""}: {text}\n'
 
 
 def _described() -> dict[str, str]:
-    """The row of each parameter."""
+    """The line of each parameter."""
     rows = {
-        'robot': _row(
-            '`robot`',
+        'robot': _item(
+            'robot',
             '',
-            'a name',
             "The first part of every key. If empty: `SHADOWHOUND_ROBOT`, otherwise the node's namespace, otherwise `thor` if the "
             'messages of a Go2 are installed, otherwise the host name.',
         ),
-        'sensors': _row(
-            '`sensors`',
+        'sensors': _item(
+            'sensors',
             'those of a Go2',
-            'names',
             'The sensors to log, instead of the default ones. Other names also need `topics` ([how](extending.md#add-a-sensor)).',
         ),
     }
     for prefix, kind in ((SENSOR, SensorSettings), *GROUPS.items()):
         for spec in fields(kind):
             if spec.metadata:
-                name, live = f'{prefix}.{spec.name}', '; **live**' if spec.metadata['live'] else ''
-                rows[name] = _row(f'`{name}`', _shown(_default(spec)), _allowed(spec) + live, spec.metadata['help'])
+                name, told = f'{prefix}.{spec.name}', [*_allowed(spec), *(['**live**'] if spec.metadata['live'] else [])]
+                rows[name] = _item(name, _shown(_default(spec)), ' '.join((spec.metadata['help'], *told)))
     return rows
 
 
@@ -378,19 +369,13 @@ def _default(spec: Field[Any]) -> Any:
     return () if spec.default is MISSING else spec.default
 
 
-def _allowed(spec: Field[Any]) -> str:
-    """The bounds of a value, as ``config`` checks them."""
+def _allowed(spec: Field[Any]) -> Iterator[str]:
+    """The bounds of a value, as ``config`` checks them; lists, texts, true and false need no word."""
     low, high, choices = (spec.metadata[name] for name in ('low', 'high', 'choices'))
-    default = _default(spec)
     if choices:
-        return ', '.join(f'`{choice}`' for choice in choices)
-    if isinstance(default, bool):
-        return '`true`, `false`'
-    if isinstance(default, tuple):
-        return 'a list of strings'
-    if low is None:
-        return 'text'
-    return f'at least {_figure(low)}{_binary(low)}' if high is None else f'{_figure(low)} to {_figure(high)}'
+        yield f'({", ".join(f"`{choice}`" for choice in choices)})'
+    elif low is not None:
+        yield f'({_figure(low)}{_binary(low)} or more)' if high is None else f'({_figure(low)} to {_figure(high)})'
 
 
 def _shown(value: Any) -> str:
@@ -398,7 +383,7 @@ def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return f'`{str(value).lower()}`'
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return ', '.join(_shown(part) for part in value)
+        return ', '.join(_shown(part) for part in value) or '`[]`'
     return f'`{value}`' + _binary(value)
 
 
@@ -406,7 +391,7 @@ def _binary(value: Any) -> str:
     """Bytes that are a power of two as people read them."""
     for unit, size in (('GiB', GIBI), ('MiB', MEBI)):
         if isinstance(value, int) and value >= size and value % size == 0:
-            return f' ({value // size} {unit})'
+            return f', {value // size} {unit}'
     return ''
 
 

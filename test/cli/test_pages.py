@@ -44,8 +44,8 @@ def test_the_exit_codes_are_in_one_table() -> None:
 
 
 def test_every_parameter_is_on_it() -> None:
-    """Each parameter that the node declares has a row of its own, or one that all sensors share."""
-    rows = {row.split('|')[1].strip() for row in parameters().splitlines() if row.startswith('|')}
+    """Each parameter that the node declares has a line, or one that all sensors share."""
+    rows = set(re.findall(r'^- (`.+?`)', parameters(), re.MULTILINE))
     names = [name.rpartition('.') for name in default_parameters()]
     named = (f'`{"SENSOR" if group in DEFAULT_SENSORS else group}{dot}{field}`' for group, dot, field in names)
     missing = [name for name in named if name not in rows]
@@ -67,7 +67,7 @@ def test_each_is_in_one_section() -> None:
 def test_each_verb_is_for_one_reader() -> None:
     """And each variable that most people set is on the page."""
     assert sorted(name for names in READERS.values() for name in names) == sorted(cli.commands)
-    assert [name for name in USUAL if f'| `{name}` |' not in parameters()] == []
+    assert [name for name in USUAL if f'\n- `{name}`' not in parameters()] == []
 
 
 def test_the_example_is_a_parameter_file() -> None:
@@ -83,7 +83,7 @@ def test_the_example_is_a_parameter_file() -> None:
 
 def test_live_parameters_are_marked() -> None:
     """Those that `ros2 param set` can change, and no others."""
-    live = {row.split('|')[1].strip() for row in parameters().splitlines() if '; **live** |' in row}
+    live = set(re.findall(r'^- (`.+?`).* \*\*live\*\*$', parameters(), re.MULTILINE))
     events = {f'`events.{name}`' for name in ('pre_s', 'post_s', 'max_s', 'max_bytes', 'log_event')}
     sensors = {f'`SENSOR.{name}`' for name in ('enabled', 'rate_hz', 'quality', 'priority')}
     assert live == {*sensors, '`upload.max_mbps`', *events}
@@ -101,7 +101,7 @@ def test_every_variable_of_the_guide_is_on_it() -> None:
     root = DOCS.parent
     files = (DOCS / 'thor.md', *(root / 'launch_configs').glob('*.service'))
     told = {name for file in files for name in re.findall(names, file.read_text(encoding='utf-8'))}
-    assert {name for name in told if f'| `{name}` |' not in parameters()} == {'ROS_DISTRO'} & told
+    assert {name for name in told if f'\n- `{name}`' not in parameters()} == {'ROS_DISTRO'} & told
 
 
 def test_every_table_is_complete() -> None:

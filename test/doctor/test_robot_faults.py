@@ -354,10 +354,10 @@ def test_a_parameter_file_for_another_node(robot: Scene, tmp_path: Path) -> None
 
 
 def test_every_check_is_on_the_page() -> None:
-    """docs/doctor.md has a row that says what it asks and what it finds."""
+    """docs/doctor.md has a line that says what it asks and what it finds."""
     page = (Path(__file__).parents[2] / 'docs' / 'doctor.md').read_text(encoding='utf-8')
-    rows = ' '.join(re.findall(r'^\| (`.*?) \|', page.partition('## The checks')[2], re.MULTILINE))
-    assert [check.name for check in CHECKS if f'`{check.name}`' not in rows] == []
+    lines = ' '.join(re.findall(r'^- (`.*?) \(', page.partition('## The checks')[2], re.MULTILINE))
+    assert [check.name for check in CHECKS if f'`{check.name}`' not in lines] == []
 
 
 def test_a_healthy_robot_gives_no_finding(robot: Scene) -> None:

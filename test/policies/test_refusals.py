@@ -588,12 +588,12 @@ def test_a_smoke_run_that_crashes_or_does_not_end(tmp_path: Path, monkeypatch: p
 
 
 def test_each_reason_is_explained_and_tested() -> None:
-    """The table in docs/policies.md has those that the code has, and each of them has a test."""
+    """The list in docs/policies.md has those that the code has, and each of them has a test."""
     root = Path(__file__).parents[2]
     code = ''.join(path.read_text() for path in (root / 'shadowhound_data_logger/policies').glob('*.py'))
     page = (root / 'docs/policies.md').read_text()
-    table = page[page.index('| reason |') : page.index('The smoke run is')]
-    explained = {reason for row in re.findall(r'^\| (`.*?) \|', table, re.MULTILINE) for reason in re.findall(r'\w+', row)}
+    listed = page[page.index('### Why a version is refused') : page.index('The smoke run is')]
+    explained = {reason for line in re.findall(r'^- (`.*?): ', listed, re.MULTILINE) for reason in re.findall(r'\w+', line)}
     raised = {*re.findall(r"PolicyRefused\(\s*'(\w+)'", code), *smoke._REASONS} - {'revocation', 'runtime'}  # of no policy
     assert raised <= explained <= {*re.findall(r"'(\w+)'", code)}
     tests = ''.join(path.read_text() for path in Path(__file__).parent.glob('test_*.py'))
