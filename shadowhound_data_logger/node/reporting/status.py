@@ -181,7 +181,7 @@ class Status:
         found = self._stages.intake.found
         if found is None or not found.is_of_another_robot:
             return rows
-        return {topic: row for topic, row in rows.items() if row.publishers or row.received or not row.enabled}
+        return {topic: row for topic, row in rows.items() if row.publishers or row.received}
 
     def _topic(self, topic: str, source: SubscriberStatus | None, totals: Totals, now_s: float) -> TopicStatus:
         rate_hz = 0.0
