@@ -249,7 +249,7 @@ class Events:
             if fresh:
                 recording.write(held.batch._replace(messages=fresh))
             self._sync(recording)
-        recording.count_dropped(self.claims.take_dropped())
+        recording.output.count_dropped(self.claims.take_dropped())
         self._sync(recording)
 
     def _sync(self, recording: Recording) -> None:

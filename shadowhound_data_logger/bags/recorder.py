@@ -243,7 +243,7 @@ class Recorder:
 
         def end() -> None:
             self._writing = None
-            recording.count_dropped(self._queue.take_dropped())
+            recording.output.count_dropped(self._queue.take_dropped())
             try:
                 if recording.close(deadline_s):
                     done.set()
@@ -277,6 +277,6 @@ class Recorder:
 
     def _sync(self) -> None:
         if self._writing is not None and time.monotonic() >= self._due_s:
-            self._writing.count_dropped(self._queue.take_dropped())
+            self._writing.output.count_dropped(self._queue.take_dropped())
             self._writing.tick()
             self._due_s = time.monotonic() + SYNC_S

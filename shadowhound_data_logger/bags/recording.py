@@ -124,7 +124,7 @@ class Recording:
         self.refused = ''
         """Reason why nothing is being written; empty if the disk accepts writes."""
         self._context = context
-        self._output = _BagOutput(state, context, settings.priority)
+        self.output = _BagOutput(state, context, settings.priority)
         self._settings = settings
         self._recovery = recovery
         self._monotonic = monotonic
@@ -139,18 +139,18 @@ class Recording:
         self._broken: list[tuple[Path, Counter[str], str]] = []
         """Slices with a failed write: path, the messages written to it, and the reason."""
         self._slice_started_s = self._retry_at_s = 0.0
-        self._output.put_rows()
+        self.output.put_rows()
 
     @property
     def bytes(self) -> int:
         """Size of all slices, including those that were delivered."""
         writer = self._writer
-        return self._output.bytes + (writer.size if writer is not None else 0)
+        return self.output.bytes + (writer.size if writer is not None else 0)
 
     @property
     def dropped(self) -> int:
         """Messages that this recording dropped."""
-        return self._output.dropped
+        return self.output.dropped
 
     def write(self, batch: MessageBatch) -> None:
         """Record messages, or drop and count them if the disk accepts no writes. Later slices repeat the latched ones."""
@@ -161,7 +161,7 @@ class Recording:
 
     def _record(self, batch: MessageBatch) -> None:
         if self._writer is None and not self._open_slice():
-            self._output.drop(batch, self.refused or UNWRITABLE)
+            self.output.drop(batch, self.refused or UNWRITABLE)
             return
         writer = self._writer
         assert writer is not None
@@ -190,10 +190,6 @@ class Recording:
             for cdr, source_ns, _, number, _, stamp_ns, *_ in batch.messages:
                 writer.write(channel, log_ns, stamp_ns if stamp_ns >= EARLIEST_SANE_NS else source_ns, number or 0, cdr)
         self._repeated_bytes = writer.size - size
-
-    def count_dropped(self, lost: Mapping[tuple[str, str], int]) -> None:
-        """Add messages, by topic and reason, that were dropped and accounted for before they reached the recording."""
-        self._output.count_dropped(lost)
 
     def tick(self) -> None:
         """Sync what was written; end the slice if its duration is over or the disk has no room."""
@@ -234,7 +230,7 @@ class Recording:
                 return True
             if is_waiting:
                 for info in state.slices.values():
-                    self._output.put_slice(info)
+                    self.output.put_slice(info)
             return finish(state, context.writer, deadline_s)
         except OSError as error:
             log.warning('bag %s: the next start completes its folder: %s', state.bag, error)
@@ -252,7 +248,7 @@ class Recording:
 
     def _update(self, record: Mapping[str, str] | None = None) -> None:
         """Store the state of the bag in the index and in the open slice."""
-        self._output.put_rows()
+        self.output.put_rows()
         if self._writer is not None:
             try:
                 self._writer.add_metadata(RECORD, record or self.state.news())
@@ -313,7 +309,7 @@ class Recording:
             return True
         self._writer = None
         self._written.clear()
-        self._output.add_slice(info)
+        self.output.add_slice(info)
         self._report_dropped()
         return True
 
@@ -346,15 +342,15 @@ class Recording:
             self._broken.pop(0)
             lost = written - Counter(info.recorded if info else {})
             for topic, count in lost.items():
-                self._output.drop_written(final.name, topic, reason, count)
+                self.output.drop_written(final.name, topic, reason, count)
             if info is not None and any(info.recorded.values()):
-                self._output.add_slice(replace(info, damage=None))
+                self.output.add_slice(replace(info, damage=None))
             elif info is not None:
                 info.path.unlink(missing_ok=True)
         return True
 
     def _report_dropped(self) -> None:
-        self._output.report_dropped(slice_file(self.state.folder.name, max(0, self.number)))
+        self.output.report_dropped(slice_file(self.state.folder.name, max(0, self.number)))
 
     def _refuse(self, reason: str, text: str) -> None:
         self._retry_at_s = self._monotonic() + RETRY_S

@@ -13,8 +13,7 @@ from rich.text import Text
 from shadowhound_data_logger.cli.common import ExitCode, exit_code, the_home, the_store
 from shadowhound_data_logger.cli.output import number, plain, print_json, print_page, shown_time
 from shadowhound_data_logger.cli.progress import progress
-from shadowhound_data_logger.shipping.audit import KEYS, THREADS, Audit, AuditProgress, audit
-from shadowhound_data_logger.spool.deliveries import Deliveries
+from shadowhound_data_logger.shipping.audit import KEYS, THREADS, Audit, AuditProgress, Deliveries, audit
 from shadowhound_data_logger.spool.status import targets
 from shadowhound_data_logger.stores.verify import KINDS
 

@@ -1,7 +1,7 @@
 """Builds one episode from one mission, in a separate folder: rows, videos, the source of each value, and gaps.
 
 The folder is complete once it has ``episode.json``; a rebuild produces the same bytes. The episode's numbers in its dataset are
-assigned later (``lerobot.py``), when it is known which earlier missions were rejected.
+assigned later (``lerobot_writer.py``), when it is known which earlier missions were rejected.
 """
 
 from __future__ import annotations

@@ -27,7 +27,8 @@ from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.datasets import plan as planning
 from shadowhound_data_logger.datasets.episodes import EPISODE_JSON, build
 from shadowhound_data_logger.datasets.features import ACTIONS, AUTO, ExportOptions
-from shadowhound_data_logger.datasets.lerobot import REPORT, Lerobot
+from shadowhound_data_logger.datasets.lerobot import REPORT
+from shadowhound_data_logger.datasets.lerobot_writer import LerobotWriter
 from shadowhound_data_logger.datasets.mobile import forget, synchronize, task_of, write_recordings
 from shadowhound_data_logger.datasets.plan import ChosenMission, EpisodePlan
 from shadowhound_data_logger.datasets.report import draw
@@ -148,18 +149,18 @@ def writing(folder: Path, *, is_dry: bool = False) -> Iterator[None]:
                         remedy='name a folder that you can write to, on a disk with free space') from error  # fmt: skip
 
 
-def resumed(folder: Path) -> Lerobot:
+def resumed(folder: Path) -> LerobotWriter:
     """The dataset, after finishing a drop that was killed."""
     pending = folder / DROPPING
     if not pending.is_file():
-        return Lerobot(folder)
+        return LerobotWriter(folder)
     pending_drop = json.loads(pending.read_text(encoding='utf-8'))
     if not (folder / INFO).is_file():
         with replacing(folder / INFO) as file:
             file.write(json.dumps(pending_drop['info']).encode())
-    made = Lerobot(folder)
+    made = LerobotWriter(folder)
     _drop(made, pending_drop['mission_id'])
-    return Lerobot(folder)
+    return LerobotWriter(folder)
 
 
 def drop(folder: Path, mission_id: str) -> str:
@@ -176,7 +177,7 @@ def drop(folder: Path, mission_id: str) -> str:
         return _drop(made, mission_id)
 
 
-def _drop(made: Lerobot, mission_id: str) -> str:
+def _drop(made: LerobotWriter, mission_id: str) -> str:
     made.drop(mission_id)
     report = json.loads((made.folder / REPORT).read_text(encoding='utf-8'))
     report['episodes'] = [each for each in report['episodes'] if each['mission_id'] != mission_id]
@@ -195,7 +196,7 @@ def _drop(made: Lerobot, mission_id: str) -> str:
     return digest
 
 
-def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int | None, str]:
+def _settled(made: LerobotWriter, options: ExportOptions) -> tuple[ExportOptions, int | None, str]:
     """The first settings of a dataset apply to all of it. Raises LakeError if the settings differ."""
     if made.settings is None:
         return options, options.fps, options.action_word
@@ -207,7 +208,7 @@ def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int 
     return options, made.settings['fps'], made.settings['action']
 
 
-def _new(made: Lerobot, missions: Sequence[ChosenMission]) -> list[ChosenMission]:
+def _new(made: LerobotWriter, missions: Sequence[ChosenMission]) -> list[ChosenMission]:
     """The missions that are not in it and were not dropped."""
     known = {*made.mission_ids}
     return [each for each in missions if each.mission_id not in known and hashed(each.mission_id) not in made.dropped]
@@ -295,7 +296,7 @@ def _tracks_of(plan: EpisodePlan) -> dict[str, Track]:
     return {**plan.tracks, **(plan.arm.tracks if plan.arm else {})}
 
 
-def _assemble(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
+def _assemble(made: LerobotWriter, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
                   recorded: Callable[[EpisodePlan], None]) -> None:  # fmt: skip
     folder = made.folder
     report: dict[str, Any] = {'settings': settings, 'episodes': _earlier_reports(made), 'dropped': made.dropped}
@@ -336,7 +337,7 @@ def split_of(mission_id: str, validation: float) -> str:
     return VALIDATION if int(hashed(mission_id)[:8], 16) / 0x1_0000_0000 < validation else TRAIN
 
 
-def _earlier_reports(made: Lerobot) -> list[dict[str, Any]]:
+def _earlier_reports(made: LerobotWriter) -> list[dict[str, Any]]:
     """Reports of the episodes in the dataset: a kill may have happened between a report and ``info.json``."""
     found = _read_json(made.folder / REPORT) if made.info else {}
     return [each for each in found.get('episodes', []) if each['mission_id'] in made.mission_ids]

@@ -207,7 +207,9 @@ class PastReader:
         grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
         runs = self._runs(robot, begin_ns, end_ns, grain_ns, by)
         bags = list(self._bag_marks(robot, begin_ns, end_ns, by))
-        kept = self._kept_runs(robot, begin_ns, end_ns, by)
+        rows = [] if self._kept.is_recorded else self._kept.rows(robot, begin_ns, end_ns)
+        on_robot = [(row['topic'] or row['sensor'] or '', *_kept_times(row, by)) for row in rows if row['where'] == ON_ROBOT]
+        kept = list(_spans(on_robot, begin_ns, end_ns))
         times = [*((run.begin_ns, run.end_ns) for run in runs), *(one[1:] for one in kept), *(mark[2:4] for mark in bags)]
         if is_fitted and times:
             begins, ends = zip(*times, strict=True)
@@ -248,11 +250,6 @@ class PastReader:
                 names[run.name] = None
                 found.append(run)
         return found
-
-    def _kept_runs(self, robot: str, begin_ns: int, end_ns: int, by: str) -> list[tuple[str, int, int]]:
-        rows = [] if self._kept.is_recorded else self._kept.rows(robot, begin_ns, end_ns)
-        kept = [(row['topic'] or row['sensor'] or '', *_kept_times(row, by)) for row in rows if row['where'] == ON_ROBOT]
-        return list(_spans(kept, begin_ns, end_ns))
 
     def range(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """The data of a time range, and commands to get it. Raises ValueError, DataLoggerError.

@@ -39,7 +39,7 @@ from shadowhound_data_logger.live.history_process import HistoryProcess, PastUna
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.live.past_routes import PastRoutes
 from shadowhound_data_logger.live.relay import Relay
-from shadowhound_data_logger.live.viewers import Graph, Viewers
+from shadowhound_data_logger.live.viewers import SILENT_S, Graph, Viewers
 from shadowhound_data_logger.spool.gaps import OBJECTS
 from shadowhound_data_logger.spool.topic_account import WRONG_TYPE
 
@@ -258,14 +258,14 @@ class LiveServer:
             await asyncio.sleep(max(0.05, began_s + FIGURES_S - time.monotonic()))
 
     async def _send_figures(self, *, with_ledger: bool) -> None:
-        async with self._reading:
-            item = await self._loop.run_in_executor(self._pool, partial(self._read_figures, with_ledger=with_ledger))
-        self.viewers.tell_all(item)
+        def read() -> LiveItem:
+            """``at`` is when their ages were correct: reading the ledger may take a while."""
+            at_ms = round(time.monotonic() * 1e3, 1)
+            return LiveItem('', 'figures', head={'at': at_ms, 'figures': self._figures.now(with_ledger=with_ledger)})
 
-    def _read_figures(self, *, with_ledger: bool) -> LiveItem:
-        """``at`` is when their ages were correct: reading the ledger may take a while."""
-        at_ms = round(time.monotonic() * 1e3, 1)
-        return LiveItem('', 'figures', head={'at': at_ms, 'figures': self._figures.now(with_ledger=with_ledger)})
+        async with self._reading:
+            item = await self._loop.run_in_executor(self._pool, read)
+        self.viewers.tell_all(item)
 
     async def _conditions(self) -> list[Condition]:
         """What alerts are about: of all robots of a store, or of this robot."""
@@ -309,7 +309,8 @@ class LiveServer:
         before_s = time.monotonic() - REQUEST_S
         for each in [each for each, since_s in self._silent.items() if since_s < before_s]:
             self._drop(each)
-        self.viewers.end_silent()
+        silent_s = time.monotonic() - SILENT_S
+        self.viewers.end(lambda one: one.received_s < silent_s)
 
     async def _end_unknown(self) -> None:
         """End the connections whose sign-in or token is no longer valid, even if other tasks hang."""

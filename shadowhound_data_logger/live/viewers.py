@@ -138,10 +138,6 @@ class Viewers:
         for task in [task for one in self.connected if ends(one) for task in one.tasks]:
             task.cancel()
 
-    def end_silent(self) -> None:
-        before_s = time.monotonic() - SILENT_S
-        self.end(lambda one: one.received_s < before_s)
-
     @property
     def is_watched_remotely(self) -> bool:
         """Whether a viewer or a player is on another machine than the robot."""

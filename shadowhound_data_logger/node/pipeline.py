@@ -22,12 +22,11 @@ The threads of the node, what each owns, and what it may wait for (``top -H -p P
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING
@@ -39,15 +38,12 @@ from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
-from shadowhound_data_logger.core import metadata_keys as meta
-from shadowhound_data_logger.core.clock import SECOND, SystemClock, now_ns, utc
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.clock_watch import ClockWatch
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
 from shadowhound_data_logger.core.dataclass_json import fields_of
 from shadowhound_data_logger.core.durable_files import flock
-from shadowhound_data_logger.core.errors import DataLoggerError, SpoolError
-from shadowhound_data_logger.core.keys import dated
-from shadowhound_data_logger.core.model import DataObject
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.options import NAMED, ON_REQUEST
 from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.core.status import MissionStatus
@@ -69,6 +65,7 @@ from shadowhound_data_logger.node.recording.bags import BagConsumer
 from shadowhound_data_logger.node.recording.events import EventBuffer
 from shadowhound_data_logger.node.recording.mission import MissionWatch
 from shadowhound_data_logger.node.recording.mission_observer import MissionObserver
+from shadowhound_data_logger.node.reporting.bookkeeping import Bookkeeping
 from shadowhound_data_logger.node.reporting.commands import Commands
 from shadowhound_data_logger.node.reporting.control import ControlSocket
 from shadowhound_data_logger.node.reporting.interface import Interface
@@ -78,7 +75,6 @@ from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.shipping.uploader import Uploader
-from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.clock_record import ClockRecord
 from shadowhound_data_logger.spool.index_check import IndexCheck
 from shadowhound_data_logger.spool.operator_requests import OperatorRequests
@@ -97,7 +93,6 @@ CLOSE_S = 5.0
 """Time for making data in memory durable at shutdown; it takes a fraction of that unless the disk hangs."""
 DAMAGED_S = 0.5
 """The same if the spool rejects all writes."""
-LEDGER_BUCKET = 'sensor-data'
 
 
 class Pipeline:
@@ -116,7 +111,6 @@ class Pipeline:
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot, settings.keep)
         self._unsynced = UnsyncedObjects(self.spool, self._clock, record, settings.robot)
         self._node = ros.node
-        self._day = self._today()
         self._due_s = 0.0
         self._failures = 0
         self._opened = ExitStack()
@@ -167,6 +161,7 @@ class Pipeline:
         self._make_request_server(track)
         keeps = self._requests is not None
         self._catalog = CatalogWriter(settings.spool_path, settings.catalog, settings.robot, self._clock, keeps=keeps)
+        self._bookkeeping = Bookkeeping(settings, self._clock, self.writer, self._unsynced.mark, self._catalog, self._link)
         self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
         sampler = Sampler(sensors, accounts, types, queue)
         accounts.oldest_open = sampler.oldest_open
@@ -256,14 +251,13 @@ class Pipeline:
             log.error('the %s did not finish its work in %g s', name, close_s)
         if not all(finished.values()):
             return
-        self._ship_ledger()
-        self._sample_link(is_last=True)
+        self._bookkeeping.end()
         self.writer.prompt = True
         self.writer.flush(1.0)
         end_s = time.monotonic() + self._settings.shutdown.drain_s
         self.uploader.drain(end_s - time.monotonic())
         self.writer.flush(1.0)
-        self._spool_parts(self._catalog.parts)
+        self._bookkeeping.spool_parts(self._catalog.parts)
         self.writer.flush(1.0)
         if self._settings.shutdown.drain_s and not self.uploader.drain(end_s - time.monotonic()):
             log.warning(
@@ -288,13 +282,8 @@ class Pipeline:
         self._name_held()
         self.uploader.wait_for(self._rules.poll())
         self.recorder.check_clock()
-        self._spool_parts(self._catalog.due)
-        self._sample_link()
+        self._bookkeeping.tick()
         self._publish_status()
-        day = self._today()
-        if day != self._day:
-            self._day = day
-            self._ship_ledger()
 
     def _handle_requests(self) -> None:
         """Called by the executor when a request waits at the control socket."""
@@ -335,12 +324,9 @@ class Pipeline:
         self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
                                        put=partial(self.writer.put, wait=False), released=self.uploader.wake,
                                        cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps,
-                                       may_send=lambda: KEEP_WHEN not in self._rules.closed, finished=self._expedite,
+                                       may_send=lambda: KEEP_WHEN not in self._rules.closed,
+                                       finished=lambda: self._catalog.expedite(),  # noqa: PLW0108 - created later
                                        thin=thinner.step)  # fmt: skip
-
-    def _expedite(self) -> None:
-        """Requested objects wait: upload them without delay."""
-        self._catalog.expedite()
 
     def _settled(self, ids: Collection[int]) -> None:
         self.uploader.settled(ids)
@@ -372,30 +358,6 @@ class Pipeline:
             if self._interface is not None:
                 self._interface.publish_diagnostics()
 
-    def _today(self) -> str:
-        return f'{utc(self._clock.wall_ns()):%Y%m%d}'
-
-    def _ship_ledger(self) -> None:
-        """A ledger that cannot be read now must not stop the node: the next one includes all its content."""
-        try:
-            self.writer.put(self._unsynced.mark(self._ledger()), wait=False)
-        except DataLoggerError as error:
-            log.warning('the ledger was not shipped: %s', error)
-
-    def _spool_parts(self, made: Callable[[], list[DataObject]]) -> None:
-        """Spool the catalog's next parts; on failure they are kept until the next call."""
-        try:
-            for part in made():
-                self.writer.put(part, wait=False)
-        except (DataLoggerError, sqlite3.Error) as error:
-            log.warning('the catalog is not written yet: %s', error)
-
-    def _sample_link(self, *, is_last: bool = False) -> None:
-        """Record upload throughput and position, if data can be requested."""
-        found = self._link.poll(is_last=is_last) if self._link is not None else None
-        if found is not None:
-            self.writer.put(found, wait=False)
-
     def _name_held(self) -> None:
         """Name the objects that waited for the clock, or as soon as the disk allows it."""
         try:
@@ -403,15 +365,3 @@ class Pipeline:
                 self.uploader.wake(named)
         except (OSError, sqlite3.Error) as error:
             log.warning('objects that wait for the clock have no names yet: %s', error)
-
-    def _ledger(self) -> DataObject:
-        """The ledger as an object for the store."""
-        at_ns = now_ns(self._clock)
-        content = ledger.read(self.spool.root, self._settings.robot)
-        robot = self._settings.robot
-        pattern = f'{robot}/_ledger/{{date}}/{{time}}_ledger.json'
-        return DataObject(
-            bucket=LEDGER_BUCKET, key=dated(pattern, at_ns), key_pattern=pattern,
-            body=json.dumps(content, indent=1).encode(), content_type='application/json', sensor='_ledger', topic=None,
-            type='', samples=0, t_start_ns=at_ns, t_end_ns=at_ns, priority=0, protected=True, metadata={meta.ROBOT: robot},
-        )  # fmt: skip

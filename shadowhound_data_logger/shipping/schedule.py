@@ -37,7 +37,7 @@ class Ship:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Ask the spool for what is pending, then call ``found`` or ``look_failed``."""
+    """Ask the spool for what is pending, then call ``found`` or ``crashed``."""
 
     exclude: frozenset[int]
     without: tuple[str, ...]
@@ -141,13 +141,6 @@ class Schedule:
             self._ahead.drop(self._waits)
             self._notify(len(self._ahead))
 
-    def look_failed(self, error: BaseException) -> None:
-        """The spool could not be asked; it is asked again."""
-        with self._changed:
-            self._last_error = f'{type(error).__name__}: {error}'
-            self._ahead.fail_look()
-            self._notify()
-
     def delivered(self, item: SpooledObject) -> Sequence[Notice]:
         """The store confirmed it: it counts as pending until ``settled``."""
         with self._changed:
@@ -183,14 +176,17 @@ class Schedule:
             self._notify()
             return Ruling(notices=notices)
 
-    def crashed(self, item: SpooledObject, error: BaseException) -> None:
-        """This program failed on it, not the store: that object alone waits."""
+    def crashed(self, step: Ship | Look, error: BaseException) -> None:
+        """This program failed, not the store: that object alone waits, or the spool is asked again."""
         with self._changed:
             self._last_error = f'{type(error).__name__}: {error}'
-            self._history.defer(item, None, self._now())
-            self._retries += 1
-            self._unsettled.discard(item.id)
-            self._let_go(item)
+            if isinstance(step, Look):
+                self._ahead.fail_look()
+            else:
+                self._history.defer(step.item, None, self._now())
+                self._retries += 1
+                self._unsettled.discard(step.item.id)
+                self._let_go(step.item)
             self._notify()
 
     def settled(self, ids: Iterable[int]) -> None:
@@ -277,51 +273,43 @@ class Schedule:
         self._breakers.release(item)
 
     def _claim(self, now: float) -> SpooledObject | None:
-        item = self._take(now)
+        """An object whose own wait is over goes first; a probe is rather one that has not failed yet."""
+        ours, enough_bytes = [each for each, _ in self._in_flight.values()], self._bytes_in(ENOUGH_S)
+
+        def has_room(item: SpooledObject) -> bool:
+            """Large objects have half of the threads, so that none of what is live waits for one of them to end.
+
+            Where a cap has enough to do, one thread is kept for what is more important than all that is under way.
+            """
+            if item.size >= LARGE_BYTES and sum(each.size >= LARGE_BYTES for each in ours) >= max(self._threads // 2, 1):
+                return False
+            if not ours or len(ours) + 1 < self._threads or sum(each.size for each in ours) <= enough_bytes:
+                return True
+            return item.priority < min(each.priority for each in ours)
+
+        def fresh() -> SpooledObject | None:
+            return self._ahead.take(lambda item: self._breakers.lets(item.bucket, now) and has_room(item))
+
+        def may_retry(item: SpooledObject) -> bool:
+            """Where a bucket is out, an object that failed there is its probe only if the spool has no other of that bucket."""
+            if item.id in self._in_flight or self._waits(item) or not self._breakers.lets(item.bucket, now):
+                return False
+            outage = self._breakers.buckets.get(item.bucket)
+            is_probe = outage and self._ahead.has_looked_since(outage.retry_at) and not self._ahead.holds(item.bucket)
+            return has_room(item) and (not outage or bool(is_probe))
+
+        store = self._breakers.store
+        if store and (len(self._history) < MANY_DEFERRED or store.failures % FRESH_PROBE_EVERY == 0):
+            item = fresh() or self._history.soonest(may_retry)
+        else:
+            item = self._history.due(now, may_retry) or fresh()
         if item is not None:
             self._in_flight[item.id] = item, self._history.delivered
             self._breakers.claim(item)
             if item.bucket in self._breakers.buckets:  # one probe at a time; the others would only hide what can go
-                self._ahead.drop(lambda other: other.bucket == item.bucket)
+                bucket = item.bucket
+                self._ahead.drop(lambda other: other.bucket == bucket)
         return item
-
-    def _take(self, now: float) -> SpooledObject | None:
-        """An object whose own wait is over goes first; a probe is rather one that has not failed yet."""
-
-        def fresh() -> SpooledObject | None:
-            return self._ahead.take(lambda item: self._breakers.lets(item.bucket, now) and self._has_room(item))
-
-        def may_retry(item: SpooledObject) -> bool:
-            return self._may_retry(item, now)
-
-        store = self._breakers.store
-        if store and (len(self._history) < MANY_DEFERRED or store.failures % FRESH_PROBE_EVERY == 0):
-            return fresh() or self._history.soonest(may_retry)
-        return self._history.due(now, may_retry) or fresh()
-
-    def _may_retry(self, item: SpooledObject, now: float) -> bool:
-        """Where a bucket is out, an object that failed there is its probe only if the spool has no other of that bucket."""
-        if (
-            item.id in self._in_flight
-            or self._waits(item)
-            or not self._breakers.lets(item.bucket, now)
-            or not self._has_room(item)
-        ):
-            return False
-        outage = self._breakers.buckets.get(item.bucket)
-        return not outage or (self._ahead.has_looked_since(outage.retry_at) and not self._ahead.holds(item.bucket))
-
-    def _has_room(self, item: SpooledObject) -> bool:
-        """Large objects have half of the threads, so that none of what is live waits for one of them to end.
-
-        Where a cap has enough to do, one thread is kept for what is more important than all that is under way.
-        """
-        ours = [each for each, _ in self._in_flight.values()]
-        if item.size >= LARGE_BYTES and sum(each.size >= LARGE_BYTES for each in ours) >= max(self._threads // 2, 1):
-            return False
-        if not ours or len(ours) + 1 < self._threads or sum(each.size for each in ours) <= self._bytes_in(ENOUGH_S):
-            return True
-        return item.priority < min(each.priority for each in ours)
 
     def _rest(self, now: float) -> Rest:
         until = [now + LOOK_EVERY_S, self._history.next_due(now)]

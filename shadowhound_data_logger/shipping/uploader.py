@@ -178,10 +178,8 @@ class Uploader:
             if step is not None:
                 self._do(step)
         except BaseException as error:
-            if isinstance(step, Ship):
-                self._schedule.crashed(step.item, error)
-            elif isinstance(step, Look):
-                self._schedule.look_failed(error)
+            if isinstance(step, (Ship, Look)):
+                self._schedule.crashed(step, error)
             if not (self._ended.is_set() and isinstance(error, Exception)):  # the spool is closed under a thread that hung
                 raise
 

@@ -11,7 +11,7 @@ from shadowhound_data_logger.core.dataclass_json import fields_of
 from shadowhound_data_logger.core.stamps import StampReport, Times
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
-from shadowhound_data_logger.spool.table import Table
+from shadowhound_data_logger.spool.schema import Table
 
 
 class AccountTable(Table):

@@ -14,12 +14,12 @@ from dataclasses import replace
 
 from shadowhound_data_logger.core.clock import Clock
 from shadowhound_data_logger.core.stamps import NO_TIMES, Times
-from shadowhound_data_logger.core.status import Totals
+from shadowhound_data_logger.core.status import OtherType, Totals
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.estimator import TopicEstimate
-from shadowhound_data_logger.spool.gaps import ESTIMATED, TopicGaps, latest
+from shadowhound_data_logger.spool.gaps import ESTIMATED, MISSED, TopicGaps, latest
 from shadowhound_data_logger.spool.span import NumberRun, Span
-from shadowhound_data_logger.spool.topic_account import MAX_PUBLISHERS, SINKS, TopicAccount
+from shadowhound_data_logger.spool.topic_account import MAX_PUBLISHERS, PAUSED, SINKS, WRONG_TYPE, TopicAccount
 
 
 class Accounts:
@@ -163,7 +163,7 @@ class Accounts:
         """The totals of every topic of this session; with ``sink`` (BAG, EVENT), those in that sink."""
         with self._lock:
             return {
-                topic.removeprefix(sink): account.totals()
+                topic.removeprefix(sink): _totals(account)
                 for topic, account in self._topics.items()
                 if (topic.startswith(sink) if sink else not topic.startswith(SINKS))
             }
@@ -255,6 +255,23 @@ class Accounts:
             for span in account.publishers.values():
                 span.gaps = account.gaps
         return account
+
+
+def _totals(account: TopicAccount) -> Totals:
+    """The account as the status shows it."""
+    paused = account.dropped[PAUSED]
+    missed_by = Counter[str]()
+    for (kind, cause, _), count in account.loss_totals().items():
+        if kind == MISSED and count:
+            missed_by[cause] += count
+    return Totals(
+        account.type, account.accounting or None, account.received, account.stored, account.skipped, account.rejected.total(),
+        account.dropped.total() - paused, paused, account.missed, account.missed_estimated, account.open,
+        account.rejected[WRONG_TYPE],
+        {name: OtherType(tuple(other.publishers), other.messages) for name, other in account.other_types.items()},
+        dict(missed_by), account.gaps.count, dict(account.by_arrival), dict(account.corrected),
+        account.stamps,
+    )  # fmt: skip
 
 
 class CarriedMessages:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.spool.gap_table import GapTable
-from shadowhound_data_logger.spool.table import Table, after
+from shadowhound_data_logger.spool.schema import Table, after
 
 _OF_SENSOR: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.spool.gaps import FORGOTTEN, LATELY_NS, OBJECTS, UNTIMED, Gap, GapRow, TakenBack, Watermark, split
-from shadowhound_data_logger.spool.table import Table
+from shadowhound_data_logger.spool.schema import Table
 
 MAX_SCANNED: Final = 5_000
 """Objects of a bucket that are read to find the first stamp of each account: some 20 ms."""

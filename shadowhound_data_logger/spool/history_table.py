@@ -9,7 +9,7 @@ from typing import Final
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.spool.gap_table import GapTable
-from shadowhound_data_logger.spool.table import Table
+from shadowhound_data_logger.spool.schema import Table
 
 FORGET_STEP: Final = 500
 """Rows of objects that one commit deletes at most: some 10 ms."""

@@ -11,7 +11,7 @@ from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
 from shadowhound_data_logger.spool.object_table import ObjectStates, ObjectTable
-from shadowhound_data_logger.spool.table import Table
+from shadowhound_data_logger.spool.schema import Table
 
 _FREE: Final = """state = 'kept' AND NOT protected
   AND NOT EXISTS (SELECT 1 FROM requested WHERE requested.id = objects.id AND outcome IN ('kept', 'pending'))"""

@@ -134,7 +134,7 @@ class NewObjects:
         key = self._index.objects.free_key(item.bucket, check_key(item.key))
         sha256 = content_sha256(item.body)
         metadata = {**facts(item), meta.SHA256: sha256}
-        if state is State.PENDING:
+        if state is State.PENDING and item.dedup:
             holder = self._repeats.holder(self._index, item, sha256)
             if holder is not None:
                 self._add_repeat(replace(item, body=holder.body), key, {**metadata, **holder.metadata})

@@ -25,7 +25,7 @@ from shadowhound_data_logger.core.model import (
 )
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
 from shadowhound_data_logger.spool.request_table import RequestedTable
-from shadowhound_data_logger.spool.table import Table, after, marks
+from shadowhound_data_logger.spool.schema import Table, after, marks
 
 MISSING: Final = 'missing'
 """Reason of a quarantined object whose file is missing."""

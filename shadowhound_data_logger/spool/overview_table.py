@@ -11,7 +11,7 @@ from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.spool.history_table import CATALOG
 from shadowhound_data_logger.spool.object_table import IN_SPOOL
-from shadowhound_data_logger.spool.table import Table, after
+from shadowhound_data_logger.spool.schema import Table, after
 
 DAY_NS: Final = 24 * 3600 * SECOND
 MAX_NS: Final = (1 << 63) - 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from shadowhound_data_logger.core.model import MissingRow, RecordingRows, SliceRow
-from shadowhound_data_logger.spool.table import Table
+from shadowhound_data_logger.spool.schema import Table
 
 
 class RecordingTable(Table):

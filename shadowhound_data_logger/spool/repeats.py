@@ -44,7 +44,8 @@ class Holder:
 class Repeats:
     """Recognizes content that a sensor has just stored.
 
-    Guarded by the spool's lock. It remembers only what this process stored: the first object after startup is always stored.
+    Guarded by the spool's lock; ``holder`` and ``stored`` are for objects with ``dedup`` that are not held. It remembers only
+    what this process stored: the first object after startup is always stored.
     """
 
     def __init__(self) -> None:
@@ -74,7 +75,7 @@ class Repeats:
     def holder(self, index: Index, item: DataObject, sha256: str) -> Holder | None:
         """The object with this content, if it is the last one that the sensor stored and is pending or delivered."""
         last = self._next.get(_source(item))
-        if not item.dedup or item.held or last is None or last.sha256 != sha256:
+        if last is None or last.sha256 != sha256:
             return None
         row = index.objects.row(item.bucket, last.key)
         if row is None or row['state'] not in _HAS_CONTENT or row['sha256'] != last.sha256:
@@ -85,8 +86,6 @@ class Repeats:
 
     def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
         """Remember an object that the sensor stored; returns the metadata that describe the repeats before it."""
-        if not item.dedup or item.held:
-            return {}
         last = self._next.get(_source(item))
         self._next[_source(item)] = _Last(key, sha256)
         if last is None or not last.repeats:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.spool.table import Table
+from shadowhound_data_logger.spool.schema import Table
 
 ACTIVE, DONE, EXPIRED, CANCELLED, REFUSED = 'active', 'done', 'expired', 'cancelled', 'refused'
 """States of a request; all but the first are final."""

@@ -1,9 +1,12 @@
-"""Creates and checks the tables of the spool's index (schema.sql), and defines which of their values are plausible."""
+"""The tables of the spool's index (schema.sql): creates and checks them, and defines which of their values are plausible.
+
+``Table`` is what the classes with their statements share.
+"""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from functools import cache
 from pathlib import Path
@@ -33,6 +36,28 @@ _CONDITIONS: Final = {
     ),
     'rhythms': f'period NOT BETWEEN 0 AND {_MAX}',
 }
+
+
+class Table:
+    """A part of the index. Methods that write must be called in one of its transactions, under the lock of the spool."""
+
+    def __init__(self, connection: Callable[[], sqlite3.Connection]) -> None:
+        """``connection`` raises SpoolError while the index is not open."""
+        self._connection = connection
+
+    @property
+    def _db(self) -> sqlite3.Connection:
+        return self._connection()
+
+
+def after(prefix: str) -> str:
+    """The first text after all texts that start with ``prefix``."""
+    return f'{prefix[:-1]}{chr(ord(prefix[-1]) + 1)}' if prefix else '\U0010ffff'
+
+
+def marks(count: int) -> str:
+    """Placeholders for a statement."""
+    return ', '.join('?' * count)
 
 
 def version_of(connection: sqlite3.Connection, path: Path) -> int:

@@ -9,7 +9,6 @@ from typing import Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS
 from shadowhound_data_logger.core.stamps import NO_TIMES, StampReport, Times
-from shadowhound_data_logger.core.status import OtherType, Totals
 from shadowhound_data_logger.spool.account_rows import TopicRow
 from shadowhound_data_logger.spool.estimator import ArrivalContext, TopicEstimate
 from shadowhound_data_logger.spool.gaps import (
@@ -277,22 +276,6 @@ class TopicAccount:
         for reason, count in self.dropped.items():
             found[DROPPED, reason, EXACT] = count
         return found
-
-    def totals(self) -> Totals:
-        """The account as the status shows it."""
-        paused = self.dropped[PAUSED]
-        missed_by = Counter[str]()
-        for (kind, cause, _), count in self.loss_totals().items():
-            if kind == MISSED and count:
-                missed_by[cause] += count
-        return Totals(
-            self.type, self.accounting or None, self.received, self.stored, self.skipped, self.rejected.total(),
-            self.dropped.total() - paused, paused, self.missed, self.missed_estimated, self.open,
-            self.rejected[WRONG_TYPE],
-            {name: OtherType(tuple(other.publishers), other.messages) for name, other in self.other_types.items()},
-            dict(missed_by), self.gaps.count, dict(self.by_arrival), dict(self.corrected),
-            self.stamps,
-        )  # fmt: skip
 
     def row(self, topic: str, count: int, newest: Times, latest_ns: int) -> TopicRow:
         """The account as it will be once ``count`` more samples, the newest with these times, are durable."""

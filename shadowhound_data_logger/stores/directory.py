@@ -68,9 +68,9 @@ class DirectoryStore:
     def put(self, item: SpooledObject) -> Put:
         check_target(item.bucket, item.key)
         target = self._path(item.bucket, item.key)
-        with self._translating(item.bucket, item.key):
+        with _translating(self._directory, item.bucket, item.key):
             if not target.exists():
-                with self._part() as part:
+                with _part(self._directory) as part:
                     _write(part, chunks(item))
                     self.pace.count(item.size)
                     if _publish(part, target):
@@ -85,22 +85,22 @@ class DirectoryStore:
             return outcome
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
-        with self._reading(bucket, key):
+        with _reading(self._directory, bucket, key):
             return self._info(bucket, key) if self._path(bucket, key).is_file() else None
 
     def get(self, bucket: str, key: str, max_bytes: int | None = None) -> bytes:
-        with self._reading(bucket, key), self._path(bucket, key).open('rb') as file:
+        with _reading(self._directory, bucket, key), self._path(bucket, key).open('rb') as file:
             body = file.read() if max_bytes is None else file.read(max_bytes + 1)
         if max_bytes is not None and len(body) > max_bytes:
             raise too_large(bucket, key, max_bytes)
         return body
 
     def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
-        with self._reading(bucket, key), self._path(bucket, key).open('rb', buffering=0) as file:
+        with _reading(self._directory, bucket, key), self._path(bucket, key).open('rb', buffering=0) as file:
             return [os.pread(file.fileno(), end - start, start) for start, end in spans]
 
     def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
-        with self._reading(bucket, key):
+        with _reading(self._directory, bucket, key):
             info = self._info(bucket, key)
             if version not in {'', info.etag}:
                 raise has_changed(bucket, key)
@@ -112,19 +112,19 @@ class DirectoryStore:
         return None if found == version else (body, found)
 
     def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
-        with self._reading(bucket, key), flock(self._directory / PARTS / 'replace.lock', mode=0o666):
+        with _reading(self._directory, bucket, key), flock(self._directory / PARTS / 'replace.lock', mode=0o666):
             if hashlib.sha256(self._path(bucket, key).read_bytes()).hexdigest() != version:
                 return False
-            with self._part() as part:
+            with _part(self._directory) as part:
                 _write(part, iter((body,)))
-                self._metadata_path(bucket, key).unlink(missing_ok=True)
+                metadata_path(self._directory, bucket, key).unlink(missing_ok=True)
                 part.replace(self._path(bucket, key))
             sync(self._path(bucket, key).parent)
         return True
 
     def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
         folder = prefix.rpartition('/')[0]
-        with self._reading(bucket, folder or 'any'):
+        with _reading(self._directory, bucket, folder or 'any'):
             found = [(key, seen) for key, seen in _files(self._directory / bucket, folder) if key.startswith(prefix)]
         for key, seen in sorted(found, key=itemgetter(0)):
             modified = datetime.fromtimestamp(seen.st_mtime, timezone.utc)
@@ -134,64 +134,36 @@ class DirectoryStore:
 
     def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
         below = prefix.rstrip('/')
-        with self._reading(bucket, below or 'any'):
+        with _reading(self._directory, bucket, below or 'any'):
             folder = self._path(bucket, below)
             return (
                 sorted(path.name for path in folder.iterdir() if is_path(path.name) and path.is_dir()) if folder.is_dir() else []
             )
 
     def delete(self, bucket: str, key: str) -> None:
-        with self._reading(bucket, key):
-            self._metadata_path(bucket, key).unlink(missing_ok=True)
+        with _reading(self._directory, bucket, key):
+            metadata_path(self._directory, bucket, key).unlink(missing_ok=True)
             self._path(bucket, key).unlink(missing_ok=True)
 
     def probe(self) -> None:
         """Write and remove a file: raises as a put for a full disk, a missing mount or a read-only one."""
-        with self._translating(), self._part() as part:
+        with _translating(self._directory), _part(self._directory) as part:
             _write(part, iter((b'probe',)))
 
     def _path(self, bucket: str, key: str) -> Path:
         return self._directory / bucket / key
 
-    @contextmanager
-    def _translating(self, bucket: str = '', key: str = '') -> Iterator[None]:
-        """Raise StoreError instead of OSError."""
-        try:
-            yield
-        except OSError as error:
-            raise _translated(error, self._directory, bucket, key) from error
-
-    @contextmanager
-    def _reading(self, bucket: str, key: str) -> Iterator[None]:
-        check_read(bucket, key)
-        with self._translating(bucket, key):
-            try:
-                yield
-            except FileNotFoundError as error:
-                where = f'{bucket}/{key} in {self._directory}'
-                raise ObjectRefused(f'there is no {where}', reason='missing', bucket=bucket, key=key) from error
-
     def _pieces(self, bucket: str, key: str, start: int) -> Iterator[bytes]:
-        with self._reading(bucket, key), self._path(bucket, key).open('rb', buffering=0) as file:
+        with _reading(self._directory, bucket, key), self._path(bucket, key).open('rb', buffering=0) as file:
             file.seek(start)
             while chunk := file.read(CHUNK_BYTES):
                 yield chunk
 
-    @contextmanager
-    def _part(self) -> Iterator[Path]:
-        """The path of an unfinished file, which is removed afterwards."""
-        part = self._directory / PARTS / uuid.uuid4().hex
-        part.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            yield part
-        finally:
-            part.unlink(missing_ok=True)
-
     def _write_metadata(self, item: SpooledObject) -> None:
         record = {'content_type': item.content_type, 'metadata': object_metadata(item)}
-        path = self._metadata_path(item.bucket, item.key)
+        path = metadata_path(self._directory, item.bucket, item.key)
         _make_folders(path.parent)
-        with self._part() as part:
+        with _part(self._directory) as part:
             _write(part, iter((json.dumps(record).encode(),)))
             part.replace(path)
         sync(path.parent)
@@ -200,14 +172,47 @@ class DirectoryStore:
         seen = self._path(bucket, key).stat()
         size, etag = seen.st_size, str(seen.st_mtime_ns)
         try:
-            record = from_json(self._metadata_path(bucket, key).read_bytes())
+            record = from_json(metadata_path(self._directory, bucket, key).read_bytes())
             metadata, content_type = dict(record['metadata']), str(record['content_type'])
         except (FileNotFoundError, ValueError, TypeError, LookupError):  # truncated, or written by another program
             return ObjectInfo(bucket, key, size, None, etag=etag)
         return ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, content_type, etag)
 
-    def _metadata_path(self, bucket: str, key: str) -> Path:
-        return self._directory / METADATA / bucket / f'{key}.json'
+
+def metadata_path(directory: Path, bucket: str, key: str) -> Path:
+    """The file with an object's metadata."""
+    return directory / METADATA / bucket / f'{key}.json'
+
+
+@contextmanager
+def _translating(directory: Path, bucket: str = '', key: str = '') -> Iterator[None]:
+    """Raise StoreError instead of OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise _translated(error, directory, bucket, key) from error
+
+
+@contextmanager
+def _reading(directory: Path, bucket: str, key: str) -> Iterator[None]:
+    check_read(bucket, key)
+    with _translating(directory, bucket, key):
+        try:
+            yield
+        except FileNotFoundError as error:
+            where = f'{bucket}/{key} in {directory}'
+            raise ObjectRefused(f'there is no {where}', reason='missing', bucket=bucket, key=key) from error
+
+
+@contextmanager
+def _part(directory: Path) -> Iterator[Path]:
+    """The path of an unfinished file, which is removed afterwards."""
+    part = directory / PARTS / uuid.uuid4().hex
+    part.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield part
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _translated(error: OSError, directory: Path, bucket: str, key: str) -> StoreError:

@@ -65,7 +65,7 @@ _Answer = TypeVar('_Answer')
 class ObstoreStore:
     """Reads, lists and deletes through obstore; an S3Store does everything else.
 
-    ``_lock`` guards the clients and the S3Store, which is opened when it is needed.
+    ``_lock`` guards the S3Store, which is opened when it is needed.
     """
 
     def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
@@ -73,11 +73,8 @@ class ObstoreStore:
         self._upload = upload
         self._endpoint = settings.endpoint_url or ''
         self._lock = threading.Lock()
-        self._clients: dict[str, Client] = {}
+        self._clients = _Clients(settings)
         self._opened: S3Store | None = None
-
-    def __repr__(self) -> str:
-        return f'ObstoreStore({self.describe()!r})'
 
     @property
     def pace(self) -> Pace:
@@ -91,7 +88,7 @@ class ObstoreStore:
     def close(self) -> None:
         with self._lock:
             opened, self._opened = self._opened, None
-            self._clients.clear()
+        self._clients.close()
         if opened is not None:
             opened.close()
 
@@ -113,7 +110,7 @@ class ObstoreStore:
             except refused.PermissionDeniedError:  # HEAD has no body: request the reason
                 return _info(bucket, key, obstore.get(client, key, options={'range': (0, 1)}))
 
-        return self._request(bucket, key, head)
+        return self._clients.request(bucket, key, head)
 
     def get(self, bucket: str, key: str, max_bytes: int | None = None) -> bytes:
         return joined(self.content(bucket, key), max_bytes)
@@ -131,7 +128,7 @@ class ObstoreStore:
                     raise
             return [self.ranges(bucket, key, [span])[0] for span in spans] if len(spans) > 1 else [b'']
 
-        return self._request(bucket, key, read)
+        return self._clients.request(bucket, key, read)
 
     def changed(self, bucket: str, key: str, version: str, max_bytes: int) -> tuple[bytes, str] | None:
         return self._s3.changed(bucket, key, version, max_bytes)
@@ -171,7 +168,7 @@ class ObstoreStore:
             return self._s3.folders(bucket, prefix)
 
     def delete(self, bucket: str, key: str) -> None:
-        self._request(bucket, key, lambda client: obstore.delete(client, key))
+        self._clients.request(bucket, key, lambda client: obstore.delete(client, key))
 
     @property
     def _s3(self) -> S3Store:
@@ -186,7 +183,7 @@ class ObstoreStore:
 
     def _below(self, bucket: str, prefix: str) -> Any:
         try:
-            return self._request(
+            return self._clients.request(
                 bucket, prefix, lambda client: obstore.list_with_delimiter(client, prefix or None), is_listing=True
             )
         except BucketMissing:
@@ -204,9 +201,9 @@ class ObstoreStore:
             known = len(found)
             try:
                 if found:
-                    with_retries(lambda: self._request(bucket, folder, read, is_listing=True))
+                    with_retries(lambda: self._clients.request(bucket, folder, read, is_listing=True))
                 else:
-                    self._request(bucket, folder, read, is_listing=True)
+                    self._clients.request(bucket, folder, read, is_listing=True)
             except BucketMissing:
                 return found
             except StoreUnavailable:
@@ -218,9 +215,9 @@ class ObstoreStore:
     def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         check_read(bucket, key)
         options: Any = {**({'range': {'offset': start}} if start else {}), **({'if_match': version} if version else {})}
-        with self._translating(bucket, key):
+        with self._clients.translating(bucket, key):
             try:
-                found = obstore.get(self._client(bucket), key, options=options or None)
+                found = obstore.get(self._clients.of(bucket), key, options=options or None)
             except refused.PreconditionError:
                 raise has_changed(bucket, key) from None
             except refused.BaseError as error:
@@ -230,17 +227,21 @@ class ObstoreStore:
             info = replace(_info(bucket, key, found), etag=found.meta['e_tag'] or '')
             if version not in {'', info.etag}:  # the server ignores the condition
                 raise has_changed(bucket, key)
-            return Content(info, self._pieces(bucket, key, found, is_small=not start))
+            return Content(info, _pieces(self._clients, bucket, key, found, is_small=not start))
 
-    def _pieces(self, bucket: str, key: str, found: Any, *, is_small: bool) -> Iterator[bytes]:
-        with self._translating(bucket, key):
-            if is_small and found.meta['size'] <= CHUNK_BYTES:  # for a range, it would accept any number of bytes
-                yield found.bytes()
-            else:
-                yield from found.stream(min_chunk_size=CHUNK_BYTES)
 
-    def _client(self, bucket: str) -> Client:
-        """The client of a bucket, which keeps its connections."""
+class _Clients:
+    """The obstore clients of one server, one per bucket, which keep their connections. Thread-safe."""
+
+    def __init__(self, settings: StoreSettings) -> None:
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._clients: dict[str, Client] = {}
+
+    def __len__(self) -> int:
+        return len(self._clients)
+
+    def of(self, bucket: str) -> Client:
         with self._lock:
             client = self._clients.pop(bucket, None) or _client(self._settings, bucket)
             self._clients[bucket] = client  # most recently used last
@@ -248,17 +249,30 @@ class ObstoreStore:
                 self._clients.pop(next(iter(self._clients)))
             return client
 
-    def _request(self, bucket: str, key: str, request: Callable[[Client], _Answer], *, is_listing: bool = False) -> _Answer:
+    def close(self) -> None:
+        with self._lock:
+            self._clients.clear()
+
+    def request(self, bucket: str, key: str, request: Callable[[Client], _Answer], *, is_listing: bool = False) -> _Answer:
         check_read(bucket, 'any' if is_listing else key)
-        with self._translating(bucket, key):
-            return request(self._client(bucket))
+        with self.translating(bucket, key):
+            return request(self.of(bucket))
 
     @contextmanager
-    def _translating(self, bucket: str, key: str) -> Iterator[None]:
+    def translating(self, bucket: str, key: str) -> Iterator[None]:
+        """Raise StoreError instead of obstore's errors."""
         try:
             yield
         except (refused.BaseError, FileNotFoundError, ValueError) as error:  # ValueError: a key with an unsafe part
-            raise _translated(error, self._endpoint, bucket, key) from None  # its text contains the key id
+            raise _translated(error, self._settings.endpoint_url or '', bucket, key) from None  # its text contains the key id
+
+
+def _pieces(clients: _Clients, bucket: str, key: str, found: Any, *, is_small: bool) -> Iterator[bytes]:
+    with clients.translating(bucket, key):
+        if is_small and found.meta['size'] <= CHUNK_BYTES:  # for a range, it would accept any number of bytes
+            yield found.bytes()
+        else:
+            yield from found.stream(min_chunk_size=CHUNK_BYTES)
 
 
 def _client(settings: StoreSettings, bucket: str) -> Client:

@@ -193,7 +193,7 @@ def write_out(it: Desk) -> None:
 
     def sync() -> None:
         assert it.recorder._writing is not None
-        it.recorder._writing.count_dropped(it.queue.take_dropped())
+        it.recorder._writing.output.count_dropped(it.queue.take_dropped())
         it.recorder._writing.tick()
         done.set()
 

@@ -9,7 +9,7 @@ from shipping.drive import Drive
 from shipping.fakes import FakeSpool, Time
 
 from shadowhound_data_logger.core.model import SpooledObject
-from shadowhound_data_logger.shipping.schedule import LARGE_BYTES
+from shadowhound_data_logger.shipping.schedule import LARGE_BYTES, Ship
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_failed_large_object_keeps_to_its_share(spool: FakeSpool, clock: Time,
     spool.add(50, priority=9)
     first = drive.next()
     assert first == large[0]
-    drive.schedule.crashed(first, RuntimeError('for a while'))
+    drive.schedule.crashed(Ship(first), RuntimeError('for a while'))
     second = drive.next()
     clock.now += 1000.0
     under_way = [second, drive.next(), drive.next()]

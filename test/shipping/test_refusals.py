@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.errors import (
     StoreUnavailable,
 )
 from shadowhound_data_logger.shipping.failures import DENIALS, Verdict
-from shadowhound_data_logger.shipping.schedule import Rest
+from shadowhound_data_logger.shipping.schedule import Rest, Ship
 
 AWAY = StoreUnavailable('Tower is away')
 
@@ -197,7 +197,7 @@ def test_a_defect_of_ours_holds_up_that_object_only(drive: Drive) -> None:
     """It is deferred, the store is not blamed, and it is tried again."""
     first, second = drive.spool.add(2)
     assert drive.next() == first
-    drive.schedule.crashed(first, TypeError('oops'))
+    drive.schedule.crashed(Ship(first), TypeError('oops'))
     assert drive.schedule.snapshot().last_error == 'TypeError: oops'
     assert drive.next() == second
     drive.deliver(second)

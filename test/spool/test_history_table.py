@@ -13,7 +13,7 @@ from spool.making import BUCKET, NOON_NS, FakeClock, assert_whole, make, new_spo
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import DataObject, Outcome, State
-from shadowhound_data_logger.spool.deliveries import Deliveries
+from shadowhound_data_logger.shipping.audit import Deliveries
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool

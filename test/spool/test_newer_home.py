@@ -12,8 +12,8 @@ from clocks import Clocks
 from spool.making import make, new_spool, put
 
 from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.shipping.audit import Deliveries
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.listing import retry
 from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
 

@@ -14,12 +14,11 @@ from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.errors import AccessDenied, CredentialsRejected, StoreError, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject, State
-from shadowhound_data_logger.shipping.audit import KEYS, Audit, AuditProgress, audit
-from shadowhound_data_logger.spool import deliveries as deliveries_module
-from shadowhound_data_logger.spool.deliveries import Deliveries
+from shadowhound_data_logger.shipping import audit as audit_module
+from shadowhound_data_logger.shipping.audit import KEYS, Audit, AuditProgress, Deliveries, audit
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.base import Content, ObjectStore
-from shadowhound_data_logger.stores.directory import DirectoryStore
+from shadowhound_data_logger.stores.directory import DirectoryStore, metadata_path
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 
@@ -60,7 +59,7 @@ def overwrite(store: ObjectStore, item: SpooledObject, body: bytes, *, metadata:
     elif isinstance(store, DirectoryStore):
         store._path(item.bucket, item.key).write_bytes(body)
         if not metadata:
-            store._metadata_path(item.bucket, item.key).unlink()
+            metadata_path(store._directory, item.bucket, item.key).unlink()
     else:
         plain = store._s3 if isinstance(store, ObstoreStore) else store
         assert isinstance(plain, S3Store)
@@ -134,7 +133,7 @@ class Failing(MemoryStore):
 
 @pytest.fixture
 def paged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deliveries_module, 'PAGE', 10)
+    monkeypatch.setattr(audit_module, 'PAGE', 10)
 
 
 @pytest.mark.usefixtures('paged')

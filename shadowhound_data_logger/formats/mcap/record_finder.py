@@ -201,7 +201,7 @@ class RecordFinder:
         size, start = RECORD.size + length, at + RECORD.size
         content: bytes | None = None
         if op == Opcode.ATTACHMENT:
-            is_intact = self._is_attachment(at, length)
+            is_intact = _is_attachment(self, at, length)
         elif op == Opcode.DATA_END:
             next_op, next_length = self.opcode_and_length(at + size)
             is_intact = length == MIN_BYTES[op] and next_op in SUMMARY and self.fits(at + size, next_op, next_length)
@@ -225,20 +225,6 @@ class RecordFinder:
         """Whether the record has the layout of a message index."""
         entries = int.from_bytes(self.read(at + RECORD.size + 2, 4), 'little')
         return entries + INDEX_HEAD == length and not entries % INDEX_ENTRY
-
-    def _is_attachment(self, at: int, length: int) -> bool:
-        """Whether its lengths are consistent, and its CRC-32 matches if it has one."""
-        start, end = at + RECORD.size, at + RECORD.size + length
-        place = start + 16
-        for _ in range(2):  # name and media type
-            place += 4 + int.from_bytes(self.read(place, 4), 'little')
-            if place + 8 > end:
-                return False
-        place += 8 + int.from_bytes(self.read(place, 8), 'little')
-        if place + 4 != end:
-            return False
-        crc = int.from_bytes(self.read(place, 4), 'little')
-        return not crc or self.crc(start, place) == crc
 
     def _chunk(self, at: int, length: int) -> IntactChunk | None:
         found = self._unpack_chunk(at, length)
@@ -386,3 +372,18 @@ def fields_length(kind: type[Schema | Channel | Metadata | Header], content: byt
         return parsed_length(kind, content)
     except UNREADABLE:
         return None
+
+
+def _is_attachment(finder: RecordFinder, at: int, length: int) -> bool:
+    """Whether its lengths are consistent, and its CRC-32 matches if it has one."""
+    start, end = at + RECORD.size, at + RECORD.size + length
+    place = start + 16
+    for _ in range(2):  # name and media type
+        place += 4 + int.from_bytes(finder.read(place, 4), 'little')
+        if place + 8 > end:
+            return False
+    place += 8 + int.from_bytes(finder.read(place, 8), 'little')
+    if place + 4 != end:
+        return False
+    crc = int.from_bytes(finder.read(place, 4), 'little')
+    return not crc or finder.crc(start, place) == crc

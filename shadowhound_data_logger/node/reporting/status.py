@@ -130,7 +130,7 @@ class Status:
         """The current status; None if the spool cannot be read, which is logged once."""
         now_s, stages = self._monotonic(), self._stages
         try:
-            spool = stages.spool.reading.usage(self._clock.wall_ns())
+            spool = stages.spool.usage()
         except (OSError, sqlite3.Error) as error:
             self._complain(f'the status cannot be gathered: {error}')
             return None

@@ -110,7 +110,7 @@ class Setting:
         mission: Any = Missions('mission')
         self.queue = BatchQueue(QueueSettings())
         recorder: Any = Recorders('bag-writer')
-        bags: Any = None
+        bags: Any = SimpleNamespace(left_out=0)
         event_buffer: Any = EventBuffers('event-writer')
         control: Any = Threads('control')
         middleware = Middleware('auto', FAST_DDS, FAST_DDS, "the robot's own")
