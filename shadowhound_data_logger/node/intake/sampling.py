@@ -15,6 +15,7 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch, Sample
 from shadowhound_data_logger.core.options import ARCHIVES
+from shadowhound_data_logger.core.stamps import MAX_PUBLISHERS
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
@@ -206,7 +207,7 @@ class Sampler(Consumer):
         chosen: list[_Chosen] = []
         if not (drained.paused or self.idle):
             for cdr, _, publisher, _, received_ns, stamp_ns, clock, untrusted_ns in drained.messages:
-                if sampled.of(clock).rule.selects(stamp_ns, cdr):
+                if sampled.of(clock, publisher).rule.selects(stamp_ns, cdr):
                     chosen.append((clock, Sample(stamp_ns, cdr, received_ns, publisher, untrusted_ns)))
         return chosen
 
@@ -273,11 +274,16 @@ class _Sampled:
         """Messages selected from the current drain."""
         self._topic, self._type, self._has_header = topic, type_name, has_header
         self._clocks: dict[str | None, _Sampling] = {}
+        self._followed: dict[str | None, str | None] = {}  # publisher -> clock
         self._sensor = sensor
 
-    def of(self, clock: str | None) -> _Sampling:
-        """The rule and batcher for a clock."""
-        found = self._clocks.get(clock)
+    def of(self, clock: str | None, publisher: str | None) -> _Sampling:
+        """The rule and batcher for a clock that a publisher follows now; it keeps its rule when its clock changes."""
+        found, before = self._clocks.get(clock), self._followed.get(publisher, clock)
+        if before != clock or publisher not in self._followed:
+            while len(self._followed) >= MAX_PUBLISHERS:
+                del self._followed[next(iter(self._followed))]
+            self._followed[publisher] = clock
         if found is None:
             for name, each in list(self._clocks.items()):
                 if len(self._clocks) >= MAX_CLOCKS and not len(each.batcher):
@@ -285,12 +291,13 @@ class _Sampled:
             if len(self._clocks) >= MAX_CLOCKS:
                 return next(iter(self._clocks.values()))
             batcher = Batcher(self._sensor, self._topic, self._type)
-            found = self._clocks[clock] = _Sampling(self._rule(self._sensor), batcher)
+            rule = self._clocks[before].rule if before in self._clocks else self._rule(self._sensor)
+            found = self._clocks[clock] = _Sampling(rule, batcher)
         return found
 
     def add(self, clock: str | None, sample: Sample, now_s: float) -> list[Batch]:
         """Add a selected sample; returns the batches that it closes."""
-        batcher = self.of(clock).batcher
+        batcher = self.of(clock, sample.publisher).batcher
         closed = batcher.add(sample, now_s)
         if len(self._clocks) > 1 and sum(each.batcher.size for each in self._clocks.values()) >= batcher.max_bytes:
             closed += self.close()
@@ -308,8 +315,9 @@ class _Sampled:
     def follow(self, sensor: SensorSettings) -> None:
         """Apply other settings; the open batches stay."""
         if sensor.rate_hz != self._sensor.rate_hz and not sensor.on_change:
+            rules = {each.rule: self._rule(sensor) for each in self._clocks.values()}
             for each in self._clocks.values():
-                each.rule = self._rule(sensor)
+                each.rule = rules[each.rule]
         self._sensor = sensor
 
     def _rule(self, sensor: SensorSettings) -> SamplingRule:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import struct
 from collections.abc import Iterable
+from itertools import accumulate
 
 from clocks import NOON_NS
 from node.intake.test_stream import Batches
@@ -57,6 +58,17 @@ def test_two_clocks_on_a_topic_are_sampled_apart() -> None:
     found = batches([*received('a', [0] * HZ * SECONDS), *received('b', [300 * SECOND] * HZ * SECONDS)], rate_hz=1.0)
     assert 2 * SECONDS <= len(found) <= 2 * SECONDS + 2
     assert all(len(batch.samples) == 1 for batch in found)
+
+
+def test_a_publisher_that_is_late_at_times_is_sampled_once_per_period() -> None:
+    """More than a second late it seems to follow another clock, and back on time its own again: it is one publisher."""
+    stamps_ns = [NOON_NS + number * SECOND // HZ for number in range(HZ * SECONDS)]
+    late_ns = [1_500_000_000 if number % (4 * HZ) >= 2 * HZ else 0 for number in range(HZ * SECONDS)]
+    arrivals_ns = accumulate((stamp + late for stamp, late in zip(stamps_ns, late_ns, strict=True)), max)
+    messages = [message('a', *each) for each in zip(range(1, HZ * SECONDS + 1), stamps_ns, arrivals_ns, strict=True)]
+    found = [batch.samples[0].stamp_ns // SECOND for batch in batches(messages, rate_hz=1.0)]
+    assert found == sorted(set(found))
+    assert len(found) == SECONDS
 
 
 def test_two_clocks_on_a_topic_are_batched_apart() -> None:
