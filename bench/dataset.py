@@ -14,7 +14,7 @@ import hashlib
 import shutil
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
@@ -52,19 +52,19 @@ def picture(number: int) -> bytes:
     return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(coarse // 2 + noise), quality=85))
 
 
-def fill(store: S3Store, frames: int) -> int:
+def fill(store: S3Store, bodies: Sequence[bytes]) -> int:
     """Single frames of the robot thor, archives of the same of tachi, and their catalogs; returns the bytes of the frames."""
-    bodies = [picture(number) for number in range(16)]
+    frames = len(bodies)
     puts: list[tuple[str, bytes, dict[str, str]]] = []
     for number in range(frames):
         stamp = FIRST_NS + number * SECOND
-        puts.append(_object('thor', 'jpg', bodies[number % 16], stamp, stamp, 1))
+        puts.append(_object('thor', 'jpg', bodies[number], stamp, stamp, 1))
     for begin in range(0, frames, FRAMES_HZ):
         numbers = range(begin, min(begin + FRAMES_HZ, frames))
         stamps = [FIRST_NS + number * SECOND // FRAMES_HZ for number in numbers]
         report = [b'{"stamp_ns":%d,"topic":"/camera/compressed"}' % stamp for stamp in stamps]
         pairs = [
-            (stamp, (('jpg', bodies[number % 16]), ('json', about)))
+            (stamp, (('jpg', bodies[number]), ('json', about)))
             for number, stamp, about in zip(numbers, stamps, report, strict=True)
         ]
         packed = pack_tar(ArchiveFile(f'{stamp:019d}.{kind}', stamp, body) for stamp, files in pairs for kind, body in files)
@@ -82,7 +82,7 @@ def fill(store: S3Store, frames: int) -> int:
             obstore.put(
                 store, schema.OBJECTS.part_key(robot, schema.date_of(rows[start]), name), parts.encode(rows[start : start + 60])
             )
-    return sum(len(bodies[number % 16]) for number in range(frames))
+    return sum(map(len, bodies))
 
 
 def _object(robot: str, extension: str, body: bytes, first: int, last: int, count: int) -> tuple[str, bytes, dict[str, str]]:
@@ -129,7 +129,8 @@ def measure(options: argparse.Namespace) -> Report:
         bare = S3Store(schema.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
                        region=settings.region, secret_access_key=settings.secret_access_key, virtual_hosted_style_request=False,
                        client_options={'allow_http': True})  # fmt: skip
-        size = fill(bare, options.frames)
+        pictures = [picture(number) for number in range(16)]
+        size = fill(bare, [pictures[number % 16] for number in range(options.frames)])
         progress(f'{options.frames} frames of {size / options.frames / 1000:.0f} KB, once more in archives')
         ways: dict[str, Callable[[], int]] = {
             'guide': lambda: guide(settings, folder / 'downloaded'),
