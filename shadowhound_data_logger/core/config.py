@@ -61,6 +61,7 @@ __all__ = [
     'default_parameters',
     'default_robot',
     'endpoint_url',
+    'has_go2_messages',
     'home',
     'store_settings',
 ]  # fmt: skip
@@ -200,12 +201,17 @@ def _listed(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
+def has_go2_messages(environ: Mapping[str, str]) -> bool:
+    """Whether a message package of a Go2 is sourced."""
+    shares = [Path(prefix) / 'share' for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix]
+    return any((share / package).is_dir() for share in shares for package in GO2_PACKAGES)
+
+
 def default_robot(environ: Mapping[str, str], namespace: str = '/') -> str:
     """The default name of the robot: the namespace, ``thor`` if the messages of a Go2 are installed, otherwise the host name."""
     if name := namespace.strip('/').replace('/', '_'):
         return name
-    shares = [Path(prefix) / 'share' for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix]
-    if any((share / package).is_dir() for share in shares for package in GO2_PACKAGES):
+    if has_go2_messages(environ):
         return DEFAULT_ROBOT
     return re.sub(r'[^A-Za-z0-9_-]', '_', socket.gethostname()).strip('_-') or 'robot'
 

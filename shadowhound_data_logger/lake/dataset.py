@@ -70,6 +70,7 @@ class MissionDataset:
         Raises:
             SettingError: an argument is invalid.
             StoreError: the store cannot be read.
+            UnknownName: the catalog has no sensor of the anchor's name, or none of a name in ``flags``.
             LakeError: the catalog contradicts itself.
         """
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no tables

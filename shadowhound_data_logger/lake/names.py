@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import UnknownName
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -77,7 +76,7 @@ def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None
             name: [*found[name], *(kept[name].to_pylist() if kept is not None else ())] for name in columns
         }
         for name in _COLUMNS:
-            if name in known and not (name == 'sensor' and flags[name] in DEFAULT_SENSORS):  # one of these may have nothing yet
+            if name in known:
                 check_name_of(name.replace('_', ' '), flags[name], known[name])
         if flags.get('mission'):
             ids = [*known['mission_id'], *known['run_id']]

@@ -20,6 +20,7 @@ from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.names import check_names
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.pull import request_and_wait
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
@@ -73,7 +74,8 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
            flags: Mapping[str, Any], findings: Findings) -> Selection:  # fmt: skip
     """Select the objects of a dataset.
 
-    Raises SettingError for an invalid query, LakeError if an aligned sensor has no objects, StoreError.
+    Raises SettingError for an invalid query, UnknownName for an anchor or a name in ``flags`` that the catalog does not have,
+    LakeError if an aligned sensor has no objects, StoreError.
     """
     for name, how in aligned.items():
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
@@ -83,6 +85,8 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
     found = _kept(found, pc.is_in(ends, value_set=pa.array(sorted(IMAGES | CLOUDS | ARCHIVES))))
     anchors = tracks_of(_possible(found, findings))
     del found, ends
+    if not anchors:
+        check_names(source, findings, sensor=anchor, **flags)
     sides = _sides(source, list(anchors.values()), aligned, findings, flags) if anchors else {}
     pa.default_memory_pool().release_unused()  # 1 GB for a million rows
     return Selection(tuple(anchors.values()), dict(aligned), sides, size, flags.get('by', BY_STAMP))

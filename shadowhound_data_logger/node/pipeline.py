@@ -40,7 +40,7 @@ from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.clock_watch import ClockWatch
-from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings, has_go2_messages
 from shadowhound_data_logger.core.dataclass_json import fields_of
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import SpoolError
@@ -226,9 +226,10 @@ class Pipeline:
         log.info(self.describe())
 
     def describe(self) -> str:
-        """The data flow in one line."""
+        """The data flow in one line, on a Go2 with the default sensors that are not logged."""
         listed = {sensor.name for sensor in self._settings.sensors}
         others = [name for name, own in DEFAULT_SENSORS.items() if name not in listed and own.get('enabled', True)]
+        others = others if has_go2_messages(os.environ) else []
         left_out = f'; not logged, because sensors does not list them: {", ".join(others)}' if others else ''
         return f'logging {" ".join(self.intake.topics)} to {self._store.describe()}, spool {self.spool.root}{left_out}'
 

@@ -14,7 +14,7 @@ from lake.making import NOON_NS, folder_store, merge
 from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, jpeg, seconds_of
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, SettingError, UnknownName
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, Near, Window, query, selecting
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -246,6 +246,14 @@ def test_a_folder_without_rows_is_no_data_set(tmp_path: Path) -> None:
     for folder in ('nowhere', 'data'):
         with pytest.raises(LakeError, match=f'{folder} has no catalog'):
             MissionDataset(tmp_path / folder)
+
+
+def test_an_anchor_that_the_store_does_not_have_is_an_error(tmp_path: Path) -> None:
+    """Also one of the default sensors; a time without frames is a dataset without samples."""
+    source = drive(tmp_path, 2)
+    with pytest.raises(UnknownName, match="there is no sensor 'voxel_map'"):
+        MissionDataset(source, anchor='voxel_map')
+    assert len(MissionDataset(source, since='2020-01-01', until='2020-01-02')) == 0
 
 
 def test_a_sensor_of_which_nothing_is_known_is_no_neighbour(tmp_path: Path) -> None:
