@@ -54,6 +54,7 @@ class MissionFinder:
 
     def __init__(self, home: Path, robot: str) -> None:
         self._home = home
+        self._folder = home / MISSIONS
         self._robot = robot
         self._known: set[str] = set()
         self._open: dict[str, MissionFolder] = {}  # missions that have not ended, or have no first record yet
@@ -76,7 +77,7 @@ class MissionFinder:
     def _find(self) -> None:
         """Find new missions. List the folder once more after a change, because two changes may have the same time."""
         try:
-            changed_ns = os.stat(self._home / MISSIONS).st_mtime_ns  # noqa: PTH116 - several times a second
+            changed_ns = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - several times a second
         except FileNotFoundError:
             return
         if changed_ns == self._listed_ns:

@@ -26,7 +26,7 @@ from shadowhound_data_logger.spool.writer import SpoolWriter
 
 log = logging.getLogger(__name__)
 
-WAIT_S: Final = 0.5
+WAIT_S: Final = 5.0
 THREADS: Final = min(max(2, len(os.sched_getaffinity(0)) // 2), 4)
 """Encoder threads: half the cores that this process may use, at least two, at most four."""
 MAX_MESSAGES: Final = 50_000

@@ -129,17 +129,18 @@ class MessageTimes:
 
     def date(self, message: Taken, publisher: str | None) -> tuple[Taken, Sequence[str]]:
         """The message with its publisher and its times, and the reasons why its arrival replaced one of these."""
-        cdr, source_ns, _, _, received_ns, *_ = message
+        cdr, source_ns, _, number, received_ns, *_ = message
         stamp_ns = header_stamp_ns(cdr) if self._has_header else 0
         track = self._tracks.of(publisher)
         dated = track.date(stamp_ns, source_ns, received_ns)
         clock = publisher or '' if track.is_apart and not dated.refused else None
         untrusted_ns = stamp_ns or source_ns if dated.refused else 0
-        known = message._replace(publisher=publisher, stamp_ns=dated.ns, clock=clock, untrusted_ns=untrusted_ns)
         sent = self._sent(0, source_ns, received_ns)
-        if not sent.refused:
-            return known, (dated.refused,) if dated.refused else ()
-        return known._replace(source_ns=sent.ns), tuple({sent.refused, dated.refused} - {''})
+        sent_ns = sent.ns if sent.refused else source_ns
+        known = Taken(cdr, sent_ns, publisher, number, received_ns, dated.ns, clock, untrusted_ns)  # _replace takes twice as long
+        if not (sent.refused or dated.refused):
+            return known, ()
+        return known, tuple({sent.refused, dated.refused} - {''})
 
     def report(self) -> StampReport | None:
         """Unusual stamps at present."""
