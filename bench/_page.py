@@ -165,25 +165,29 @@ def _backlog_memory(figures: Figures) -> str:
 
 
 def _rosbag2(figures: Figures) -> str:
-    if 'rosbag2' not in figures:
-        return '*not measured*'
-    found = figures['rosbag2']
+    version = f'rosbag2 {figures.get("version", "")}'.strip()
+    words = {'rosbag2': version, 'bag': 'the node, into a bag', 'objects': 'the node, as objects'}
 
-    def us(recorder: str, runs: Figures) -> list[str]:
-        return [f'{sum(used) / len(used):.0f} us ({min(used):.0f} to {max(used):.0f})'
-                for used in (run['us'][recorder] for run in runs.values() if recorder in run['us'])]  # fmt: skip
+    def us(found: Figures) -> str:
+        values = found['us']
+        return f'{sum(values) / len(values):.0f} us ({min(values):.0f} to {max(values):.0f})'
 
-    def lost(recorder: str, runs: Figures) -> str:
-        return ', '.join(f'{show(100 * run["lost"][recorder] / run["published"])} %' if run['lost'][recorder] else '0'
-                         for run in runs.values() if recorder in run['lost'])  # fmt: skip
+    def lost(found: Figures) -> str:
+        share = 100 * sum(found['lost']) / sum(found['published'])
+        return f'{show(share)} %' if share else '0'
 
-    rows = [(f'{int(rate):,}/s', *us(recorder, runs), lost(recorder, runs), words)
-            for rate, runs in found['rates'].items()
-            for recorder, words in (('node', 'the node'), ('rosbag2', f'rosbag2 {found["version"]}'.strip()))]  # fmt: skip
-    table = _table(('messages', 'recorder', 'CPU a message, alone', 'both at the same time', 'lost, alone and beside'),
-                   [(rate, words, alone, both, gone) for rate, alone, both, gone, words in rows])  # fmt: skip
-    where = f'ROS 2 {found["ros"].capitalize() or "of the machine"}, rosbag2 in {found["storage"]}'
-    return f'{table}\n\n{where}, at {found["commit"]}.' if found.get('commit') else f'{table}\n\n{where}.'
+    rows = [(f'{int(rate):,}/s', words[who], us(found), lost(found), f'{median(found["bytes"]):.0f}' if 'bytes' in found else '')
+            for rate, recorders in figures['rates'].items() for who, found in recorders.items()]  # fmt: skip
+    parts = [_table(('messages', 'recorder', 'CPU per message', 'lost', 'bytes per message'), rows)]
+    if 'job' in figures:
+        words = {'rosbag2': f'{version} and rclone', 'bag': 'the node'}
+        jobs = [(words[who], us(found), f'{median(found["copy_us"]):.0f} us' if who == 'rosbag2' else '', lost(found),
+                 f'{median(found["bytes"]) / 1000:,.0f} KB', f'{median(found["late_p50_s"]):.1f} s',
+                 f'{max(found["late_max_s"]):.1f} s') for who, found in figures['job'].items()]  # fmt: skip
+        head = (f'recording and delivering, {figures["job_hz"]:,}/s, files of {figures["split_s"]} s', 'CPU per message',
+                'of it rclone', 'lost', 'on the disk at the end', 'from publication to the store, median', 'maximum')  # fmt: skip
+        parts.append(_table(head, jobs))
+    return '\n\n'.join(parts)
 
 
 def _latency(figures: Figures) -> str:
@@ -308,7 +312,7 @@ _WHOLE: Final[Mapping[str, Callable[[Figures], str]]] = {'bars': _bars, 'machine
 _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'node_cpu': ('node_cpu', _node_cpu), 'intake': ('intake', _intake), 'vendors': ('vendors', _vendors),
     'small_messages': ('small_messages', _small), 'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory),
-    'backlog_memory': ('backlog_memory', _backlog_memory), 'rosbag2': ('bag_recording', _rosbag2),
+    'backlog_memory': ('backlog_memory', _backlog_memory), 'rosbag2': ('rosbag2', _rosbag2),
     'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
     'keep': ('keep', _keep),
     'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),

@@ -11,6 +11,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -49,6 +50,7 @@ STEPS: Final = (
     Step('full_rate', ('--seconds', '60', '--away', '300'), ('--seconds', '10', '--away', '10')),
     Step('backlog_memory', (), ('--seconds', '5', '--away', '10', '--back', '20')),
     Step('bag_recording', ('--seconds', '40'), ('--seconds', '10')),
+    Step('rosbag2', ('--seconds', '20'), None),
     Step('latency', ('--seconds', '30'), ('--seconds', '8', '--away', '10')),
     Step('drain', ('--rounds', '5', '--scale', '0.3'), ('--rounds', '2', '--scale', '0.1')),
     Step('mission_calls', ('--seconds', '20'), ('--seconds', '3')),
@@ -63,6 +65,10 @@ STEPS: Final = (
     Step('keep', ('--seconds', '140'), None),
 )
 FOLDERLESS: Final = ('encode_formats',)
+ABSENT: Final = {
+    name for name, is_here in {'datasets': LEROBOT.is_file(), 'rosbag2': shutil.which('ros2')}.items() if not is_here
+}
+"""Benchmarks against programs that are not on this machine: the page keeps the earlier results."""
 
 
 def run(step: Step, folder: Path, *, quick: bool) -> dict[str, Any] | None:
@@ -116,19 +122,6 @@ def machine() -> dict[str, str]:
     }  # fmt: skip
 
 
-def _keep_rosbag2(found: Mapping[str, Any]) -> None:
-    """Without rosbag2, keep the results of an earlier machine, with their commit."""
-    measured = found.get('bag_recording')
-    if measured is None:
-        return
-    figures = measured['figures']
-    if 'rosbag2' in figures:
-        figures['rosbag2']['commit'] = _commit()
-    else:
-        earlier = json.loads((DOCS / RESULTS).read_text(encoding='utf-8'))['benches'].get('bag_recording', {})
-        figures |= {name: value for name, value in earlier.get('figures', {}).items() if name == 'rosbag2'}
-
-
 def _earlier(name: str) -> dict[str, Any]:
     """The page's earlier results of a benchmark, with its commit and machine."""
     benches = json.loads((DOCS / RESULTS).read_text(encoding='utf-8'))['benches']
@@ -173,16 +166,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start = time.monotonic()
     results: dict[str, Any] = {'machine': machine(), 'quick': options.quick}
     steps = [step for step in STEPS if (step.name in options.only if options.only else step.quick is not None or whole)
-             and (step.name != 'datasets' or LEROBOT.is_file())]  # fmt: skip
+             and step.name not in ABSENT]  # fmt: skip
     found = {step.name: run(step, options.folder, quick=options.quick) for step in steps}
-    _keep_rosbag2(found)
     where = {name: results['machine'][name] for name in ('commit', 'processor')}
     results['benches'] = benches = {name: {**answer, **where} for name, answer in found.items() if answer is not None}
     results['took_s'] = round(time.monotonic() - start)
     is_complete = len(benches) == len(steps)
     held = all(bar['holds'] for answer in benches.values() for bar in answer['bars'])
-    if whole and not LEROBOT.is_file():
-        benches |= _earlier('datasets')
+    for name in ABSENT if whole else ():
+        benches |= _earlier(name)
     whole = whole and is_complete
     output = options.output or (DOCS if whole else options.folder / 'page')
     output.mkdir(parents=True, exist_ok=True)

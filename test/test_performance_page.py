@@ -63,29 +63,27 @@ def test_what_training_sets_cost_beside_lerobots_writer_is_on_the_page(page: Any
     assert '<!-- bench datasets -->' in PAGE.read_text(encoding='utf-8')
 
 
-def test_what_rosbag2_costs_beside_the_node_is_on_the_page(page: Any) -> None:
-    """Two lines for each rate; loss is a share of what was published."""
+def test_what_rosbag2_costs_next_to_the_node_is_on_the_page(page: Any) -> None:
+    """A line per rate and recorder, and one per recorder for the complete job; loss is a share of what was published."""
 
-    def run(published: int, **recorders: tuple[list[float], int]) -> dict[str, Any]:
-        return {
-            'published': published,
-            'us': {name: used for name, (used, _) in recorders.items()},
-            'lost': {name: lost for name, (_, lost) in recorders.items()},
-        }
+    def runs(us: list[float], lost: int, **more: list[float]) -> dict[str, Any]:
+        return {'us': us, 'published': [500, 500], 'lost': [lost, 0], 'bytes': [400.0, 400.0], **more}
 
-    runs = {
-        'alone': run(1000, node=([10.0, 14.0], 0)),
-        'rosbag2 alone': run(1000, rosbag2=([60.0, 60.0], 30)),
-        'together': run(2000, node=([11.0], 0), rosbag2=([70.0], 5)),
-    }
-    found = {'ros': 'humble', 'version': '0.15.12', 'storage': 'mcap', 'commit': 'abc', 'rates': {'10000': runs}}
+    late = {'late_p50_s': [6.0, 6.2], 'late_max_s': [11.0, 11.5]}
+    figures = {
+        'version': '0.26.5', 'job_hz': 260, 'split_s': 10,
+        'rates': {'10000': {'rosbag2': runs([60.0, 60.0], 30), 'bag': runs([10.0, 14.0], 0)}},
+        'job': {'rosbag2': runs([90.0, 90.0], 0, copy_us=[20.0, 20.0], **late), 'bag': runs([50.0, 50.0], 0, **late)},
+    }  # fmt: skip
     block = '<!-- bench rosbag2 -->\n<!-- end rosbag2 -->\n'
-    lines = page.filled(block, {'benches': {'bag_recording': {'figures': {'rosbag2': found}}}}).splitlines()
-    assert lines[3:7] == [
-        '| 10,000/s | the node | 12 us (10 to 14) | 11 us (11 to 11) | 0, 0 |',
-        '| 10,000/s | rosbag2 0.15.12 | 60 us (60 to 60) | 70 us (70 to 70) | 3 %, 0.25 % |',
-        '',
-        'ROS 2 Humble, rosbag2 in mcap, at abc.',
+    lines = page.filled(block, {'benches': {'rosbag2': {'figures': figures}}}).splitlines()
+    assert lines[3:5] == [
+        '| 10,000/s | rosbag2 0.26.5 | 60 us (60 to 60) | 3 % | 400 |',
+        '| 10,000/s | the node, into a bag | 12 us (10 to 14) | 0 | 400 |',
     ]
-    assert '*not measured*' in page.filled(block, {'benches': {'bag_recording': {'figures': {}}}})
+    assert lines[8:10] == [
+        '| rosbag2 0.26.5 and rclone | 90 us (90 to 90) | 20 us | 0 | 0 KB | 6.1 s | 11.5 s |',
+        '| the node | 50 us (50 to 50) |  | 0 | 0 KB | 6.1 s | 11.5 s |',
+    ]
+    assert '*not measured*' in page.filled(block, {'benches': {}})
     assert '<!-- bench rosbag2 -->' in PAGE.read_text(encoding='utf-8')
