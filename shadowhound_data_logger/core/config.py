@@ -99,6 +99,8 @@ class Settings:
     robot: str
     home: Path
     sensors: tuple[SensorSettings, ...]
+    assumed: frozenset[str]
+    """Sensors that no parameter mentions: the default ones, which are those of a Unitree."""
     store: StoreSettings
     capture: CaptureSettings
     queue: QueueSettings
@@ -122,6 +124,7 @@ class Settings:
         given = {name: value for name, value in parameters.items() if name.split('.')[0] not in NOT_SETTINGS}
         robot = _robot(given.pop('robot', ''), environ, namespace)
         is_listed = 'sensors' in given
+        assumed = frozenset() if is_listed else DEFAULT_SENSORS.keys() - {name.partition('.')[0] for name in given}
         sensors = _sensors(given, robot)
         groups: dict[str, Any] = {name: _fill(kind, name, given) for name, kind in GROUPS.items()}
         if groups['capture'].topics == AUTO and is_listed:
@@ -135,7 +138,9 @@ class Settings:
             name, value = next(iter(given.items()))
             raise SettingError(name, value, f'only a known name: {_suggestions(name, sensors)}')
         folder = home(environ)
-        return cls(robot=robot, home=folder, sensors=sensors, store=store_settings(environ, folder), **groups)
+        return cls(
+            robot=robot, home=folder, sensors=sensors, assumed=frozenset(assumed), store=store_settings(environ, folder), **groups
+        )
 
 
 def home(environ: Mapping[str, str]) -> Path:
@@ -214,6 +219,12 @@ def default_robot(environ: Mapping[str, str], namespace: str = '/') -> str:
     if has_go2_messages(environ):
         return DEFAULT_ROBOT
     return re.sub(r'[^A-Za-z0-9_-]', '_', socket.gethostname()).strip('_-') or 'robot'
+
+
+def has_go2_messages(environ: Mapping[str, str]) -> bool:
+    """Whether the messages of a Go2 are installed, as on its computer."""
+    shares = [Path(prefix) / 'share' for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix]
+    return any((share / package).is_dir() for share in shares for package in GO2_PACKAGES)
 
 
 def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:

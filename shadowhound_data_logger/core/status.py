@@ -113,6 +113,8 @@ class TopicStatus(Totals):
     rate_hz: float = 0.0
     age_s: float | None = None
     """Seconds since its last message."""
+    size: int | None = None
+    """Bytes of its last message, serialized."""
 
 
 @dataclass(frozen=True, slots=True)

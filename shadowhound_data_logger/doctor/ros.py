@@ -11,18 +11,19 @@ from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.config import DEFAULT_ROBOT, SensorSettings, has_go2_messages
 from shadowhound_data_logger.core.errors import Rejected, SettingError
 from shadowhound_data_logger.core.keys import printable
-from shadowhound_data_logger.core.options import NAMED
-from shadowhound_data_logger.core.type_rules import is_of_unitree
+from shadowhound_data_logger.core.options import AUTO, COMPRESSED_IMAGE, IMAGE, NAMED, POINT_CLOUD
+from shadowhound_data_logger.core.ros_arguments import NODE
+from shadowhound_data_logger.core.type_rules import is_of_unitree, not_logged, sensor_for
 from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of, middleware
 from shadowhound_data_logger.formats.records import TRANSFORMS
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake.middleware import Middleware
-from shadowhound_data_logger.ros.endpoints import alternatives, logged_type
+from shadowhound_data_logger.ros.endpoints import Endpoint, alternatives, logged_type
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.doctor.ros_watch import WatchedTopic
@@ -66,6 +67,13 @@ TOO_SLOW, TOO_LOSSY = 0.5, 0.1
 """Below half of the expected rate; more than a tenth lost."""
 MIN_EXPECTED: Final = 4
 """Minimum number of expected messages in the window for a rate to be meaningful."""
+STEADY: Final = frozenset({
+    COMPRESSED_IMAGE, IMAGE, POINT_CLOUD, 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState',
+    'sensor_msgs/msg/LaserScan', 'sensor_msgs/msg/MagneticField', 'sensor_msgs/msg/NavSatFix', 'sensor_msgs/msg/Range',
+})  # fmt: skip
+"""Types of sensors that publish all the time: silence is a fault, whatever their rate."""
+MAX_FOUND: Final = 100
+"""Maximum topics that no sensor names to listen to."""
 TYPES_REMEDY: Final = '. ~/ros2_ws/install/setup.bash  # or: colcon build --packages-select {package} && . install/setup.bash'
 TF: Final = '/tf'
 STALE_S: Final = 5.0
@@ -96,26 +104,57 @@ def check(context: Context) -> Iterator[Result]:
         found = ros_watch.discover(node, names)
         pairs = [pair for sensor in sensors for pair in zip(sensor.topics, sensor.types, strict=False)]
         types = {resolved[topic]: logged_type(found[resolved[topic]], name) for topic, name in pairs}
+        packages = {each.type.partition('/')[0] for publishers in found.values() for each in publishers}
+        is_unitree = any(map(is_of_unitree, (f'{name}/' for name in packages)))
+        own = {sensor.name for sensor in sensors}
+        if context.settings.capture.topics != NAMED and not (is_unitree and context.settings.capture.topics == AUTO):
+            for sensor, publishers in _found(ros_watch.in_graph(node, context.namespace), own, set(names)):
+                (topic,), (types[topic],) = sensor.topics, sensor.types
+                sensors.append(sensor)
+                resolved[topic], found[topic] = topic, publishers
         if publishers := ros_watch.publishers_of(node, TF):
             found[TF] = publishers
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
         others = [] if heard else list(ros_watch.published(node))
         waiting = ros_watch.waiting_for_clock(node)
-    packages = {each.type.partition('/')[0] for publishers in found.values() for each in publishers}
     yield from _clock(waiting)
-    yield from _types(sensors, packages if heard else packages | {DRIVER})
+    configured = [sensor for sensor in sensors if sensor.name in own]
+    yield from _types(configured, packages | {DRIVER} if not heard and is_go2(context) else packages)
     if not heard:
         yield from _no_publishers(context, names, listener, others)
         return
     if TF in heard:
         yield from _transforms(heard[TF])
-    is_unitree = any(map(is_of_unitree, (f'{name}/' for name in packages)))
     is_complete = context.settings.capture.topics == NAMED or is_unitree
     streams = STREAMS if is_unitree else {}
     for sensor in sensors:
         topics = [heard[resolved[topic]] for topic in sensor.topics]
         if is_complete or any(one.publishers for one in topics):  # the default sensors are for a Unitree
             yield from _sensor(sensor, topics, context.rates_hz, streams)
+
+
+def _found(
+    graph: Mapping[str, Sequence[Endpoint]], names: Collection[str], topics: Collection[str]
+) -> Iterator[tuple[SensorSettings, list[Endpoint]]]:
+    """The sensors that the node adds for topics besides ``topics``, with their publishers; ``names`` are taken."""
+    taken = set(names)
+    types = {topic: [each.type for each in publishers] for topic, publishers in graph.items()}
+    for topic in sorted(graph.keys() - topics):
+        publishers = [each for each in graph[topic] if not each.node.endswith(f'/{NODE}')]
+        if not publishers or not_logged(topic, publishers[0].type, types):
+            continue
+        latched = all(each.transient_local for each in publishers)
+        sensor = sensor_for(topic, publishers[0].type, taken, is_latched=latched)
+        if sensor is not None and len(taken) - len(names) < MAX_FOUND:
+            taken.add(sensor.name)
+            yield sensor, publishers
+
+
+def is_go2(context: Context) -> bool:
+    """Whether the robot is a Go2 as far as this machine and the settings show, without its topics."""
+    settings = context.settings
+    named = (name for sensor in settings.sensors if sensor.name not in settings.assumed for name in sensor.types)
+    return has_go2_messages(context.environ) or settings.robot == DEFAULT_ROBOT or any(map(is_of_unitree, named))
 
 
 def _clock(waiting: Sequence[str]) -> Iterator[Result]:
@@ -235,11 +274,15 @@ def _no_publishers(
         remedy = 'shadowhound-data init --to robot.yaml  # settings for the topics that are published'
         yield error('ros.topics', what, 'the settings are for another robot', remedy)
         return
+    go2 = is_go2(context)
+    drivers = 'ps aux | grep go2_driver ; ros2 launch go2_robot_sdk robot.launch.py' if go2 else 'ros2 node list'
     yield error(
         'ros.topics',
-        f'there is no publisher of {", ".join(topics[:4])}, ... in domain {ours}',
+        f'there is no publisher of {", ".join(topics[:4])}, ... in domain {ours}'
+        if go2
+        else f'no robot publishes in domain {ours}',
         "the robot's driver is not running, is not connected to the robot, or is in another domain or network",
-        'ps aux | grep go2_driver ; ros2 launch go2_robot_sdk robot.launch.py ; echo $ROS_DOMAIN_ID  # equal everywhere?',
+        f'{drivers} ; echo $ROS_DOMAIN_ID  # equal everywhere?',
     )
 
 
@@ -339,12 +382,12 @@ def _rate(one: WatchedTopic, sensor: SensorSettings, expected_hz: float) -> Resu
     due = expected_hz * one.window_s
     if sensor.on_change and not one.received:
         return info('ros.rate', f'{one.topic}: nothing in {one.window_s:.1f} s; it is kept on change only', **figures)
-    if not one.received and due >= MIN_EXPECTED:
-        return error(
+    if not one.received and (due >= MIN_EXPECTED or one.type in STEADY):
+        return (error if due >= MIN_EXPECTED else warning)(
             'ros.loss',
             f'{one.topic} has a publisher, but no message arrives',
             'large messages are lost between driver and logger (see sockets), the two run as different users, or a firewall '
-            'drops everything but discovery; or the robot is not connected and the driver has nothing to publish',
+            'drops everything but discovery; or the device is off or not connected, and the driver has nothing to publish',
             f'ros2 topic hz {one.topic} ; shadowhound-data doctor --only sockets',
             **figures,
         )

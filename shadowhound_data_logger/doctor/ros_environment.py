@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import has_go2_messages
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.status import MiddlewareStatus
 from shadowhound_data_logger.doctor.machine import MAX_DOMAIN, Process, processes
@@ -139,12 +140,13 @@ def _driver(context: Context) -> Iterator[Result]:
     """The driver may run on another machine; if it runs here, its variables must match."""
     found = processes(context.root, *DRIVERS)
     if not found:
-        yield info(
-            'ros.driver',
-            "the robot's driver is not running on this machine",
-            'fine if it runs on another one',
-            'ros2 launch go2_robot_sdk robot.launch.py',
-        )
+        if has_go2_messages(context.environ):
+            yield info(
+                'ros.driver',
+                "the robot's driver is not running on this machine",
+                'fine if it runs on another one',
+                'ros2 launch go2_robot_sdk robot.launch.py',
+            )
         return
     ours = {name: context.environ.get(name) or DEFAULTS.get(name, '') for name in AGREE}
     differ = [

@@ -104,12 +104,17 @@ def published(ros_node: Node, within: str = '/') -> dict[str, list[Endpoint]]:
     found: dict[str, list[Endpoint]] = {}
     quiet_since = time.monotonic()
     while (now := time.monotonic()) < end or (now - quiet_since < SETTLE_S and now < end + DISCOVER_S):
-        named = [name for name, _ in ros_node.get_topic_names_and_types() if is_plain_name(name) and name not in NOT_LOGGED]
-        seen = {name: endpoints(ros_node, name) for name in named if name.startswith(f'{within.rstrip("/")}/')}
+        seen = in_graph(ros_node, within)
         if _nodes(seen) != _nodes(found):  # the name of a node arrives after its publishers
             found, quiet_since = seen, now
         time.sleep(POLL_S)
     return {topic: publishers for topic, publishers in found.items() if publishers}
+
+
+def in_graph(ros_node: Node, within: str = '/') -> dict[str, list[Endpoint]]:
+    """The same now, with topics that have no publisher."""
+    named = [name for name, _ in ros_node.get_topic_names_and_types() if is_plain_name(name) and name not in NOT_LOGGED]
+    return {name: endpoints(ros_node, name) for name in named if name.startswith(f'{within.rstrip("/")}/')}
 
 
 def _nodes(found: Mapping[str, Sequence[Endpoint]]) -> dict[str, list[str]]:

@@ -31,7 +31,7 @@ _HEAD: Final = (
 )
 _OF_STORE: Final = ('target', 'state', 'last_error', 'mbps', 'max_mbps', 'in_flight', 'delivered', 'waits_for', 'left_s')
 _OF_LEDGER: Final = ('received', 'stored', 'skipped', 'missed', 'missed_estimated', 'accounting')
-_OF_STATUS: Final = ('sensor', 'rate_hz', 'age_s', 'publishers', 'unavailable', 'may_be_silent')
+_OF_STATUS: Final = ('sensor', 'enabled', 'rate_hz', 'size', 'age_s', 'publishers', 'unavailable', 'may_be_silent')
 MAX_GAPS: Final = 4000
 """Maximum rows of the timeline; beyond it, neighboring gaps of a topic and cause are merged."""
 DAY_NS: Final = 24 * 3600 * SECOND

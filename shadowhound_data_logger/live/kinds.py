@@ -236,6 +236,10 @@ def _low_state(message: Any) -> dict[str, float]:
     }  # fmt: skip
 
 
+def _bms_state(message: Any) -> dict[str, float]:
+    return {'battery': float(message.soc), 'amperes': message.current / 1000, 'cells': float(max(message.temperature))}
+
+
 def _battery(message: Any) -> dict[str, float]:
     return {
         'battery': 100 * message.percentage,
@@ -271,8 +275,11 @@ KINDS: Final[Mapping[str, Kind]] = {
     'nav_msgs/msg/Odometry': Kind('odom', 25.0, is_bulk=False, values=_odometry, table=_odometry_table),
     'sensor_msgs/msg/JointState': Kind('joints', 20.0, is_bulk=False, values=_joints, table=_joints_table),
     'go2_interfaces/msg/LowState': Kind('battery', 2.0, is_bulk=False, values=_low_state),
+    'unitree_go/msg/LowState': Kind('battery', 2.0, is_bulk=False, values=_low_state),
+    'unitree_hg/msg/BmsState': Kind('battery', 2.0, is_bulk=False, values=_bms_state),
     'sensor_msgs/msg/BatteryState': Kind('battery', 2.0, is_bulk=False, values=_battery),
     'go2_interfaces/msg/Go2State': Kind('state', 10.0, is_bulk=False, values=_go2_state),
+    'unitree_go/msg/SportModeState': Kind('state', 10.0, is_bulk=False, values=_go2_state),
     'sensor_msgs/msg/NavSatFix': Kind('fix', 5.0, is_bulk=False, values=_fix),
 }
 """By message type, live and past; ``panels.py`` has more that is only shown live."""

@@ -167,8 +167,9 @@ class Pipeline:
         accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
         consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
-        named = [node.resolve_topic_name(topic) for sensor in settings.sensors for topic in sensor.topics]
-        found = None if settings.capture.topics == NAMED else FoundTopics(node, settings.capture.topics, named)
+        found = None
+        if settings.capture.topics != NAMED:
+            found = FoundTopics(node, settings.capture.topics, settings.sensors, settings.assumed)
         self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=track.has_pose, found=found,
                              early=self._early)  # fmt: skip
         self.recorder = Recorder(settings.bag, bags_context, bag_queue, recovery, partial(self.intake.listen, bags))

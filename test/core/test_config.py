@@ -44,9 +44,9 @@ def test_the_defaults_can_be_spelled_out() -> None:
     given = default_parameters()
     spelled_out = Settings.load(given, {})
     assert spelled_out.capture.topics == 'sensors'
-    assert replace(spelled_out, capture=load().capture) == load()
+    assert replace(spelled_out, capture=load().capture, assumed=load().assumed) == load()
     del given['sensors']
-    assert Settings.load(given, {}) == load()
+    assert replace(Settings.load(given, {}), assumed=load().assumed) == load()
 
 
 @pytest.mark.parametrize(('given', 'environ', 'namespace', 'robot'), [

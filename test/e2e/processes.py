@@ -271,10 +271,14 @@ class Processes:
         command = ['-m', SIM, '--ros-args', '-r', f'__ns:={namespace}', *given]
         return self._keep(Process(name, command, self.folder / f'{name}.log', self.environ, forked=self._forked))
 
-    def page(self, node: Node, *arguments: str, port: int = 0, program: Sequence[str] = ('-m', COMMANDS)) -> tuple[Process, str]:
+    def page(
+        self, node: Node, *arguments: str, port: int = 0, program: Sequence[str] = ('-m', COMMANDS),
+        environ: Mapping[str, str] | None = None,
+    ) -> tuple[Process, str]:  # fmt: skip
         """The live page of what this node logs, and its address."""
         name = self._name('live')
-        environ = {**self.environ, 'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
+        own = {'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
+        environ = {**self.environ, **own, **(environ or {})}
         command = [*program, 'live', '--json', '--port', str(port), *arguments]
         page = self._keep(Process(name, command, self.folder / f'{name}.log', environ))
         page.await_log('"problem"')

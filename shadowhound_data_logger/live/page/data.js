@@ -6,7 +6,7 @@ import { unseen } from './losses.js';
 import { digits, span, volume } from './words.js';
 
 const COLUMNS = [
-  ['rate', 'Hz', 'Messages per second: as the node counts them, or while the topic’s message is shown'], ['size', 'Size', 'Bytes of the newest message, serialized; known once its message was shown'],
+  ['rate', 'Hz', 'Messages per second: as the node counts them, or while the topic’s message is shown'], ['size', 'Size', 'Bytes of the newest message, serialized; of a topic that is not logged, while its message is shown'],
   ['received', 'Received', 'Messages that the node received since it first ran'], ['stored', 'Stored', 'Messages that are in objects, delivered or waiting'],
   ['missed', 'Missed', 'Messages that were published and did not reach the node; ~ is an estimate'], ['age', 'Age', 'Seconds since the newest message'],
 ];
@@ -45,7 +45,7 @@ function TopicAge({ row, figures, now }) {
 // Every topic: those of the node's report, and those that are published now. Publishers are counted by this page where it reads ROS.
 function allTopics(figures) {
   const told = new Map(topics.value.map(([topic, kind, type, publishers]) => [topic, { kind, type, publishers }]));
-  const rows = figures.topics.map((row) => ({ ...row, isLogged: Boolean(row.sensor || row.received), publishers: told.get(row.topic)?.publishers ?? (told.size ? 0 : row.publishers) }));
+  const rows = figures.topics.map((row) => ({ ...row, isLogged: Boolean((row.sensor && row.enabled !== false) || row.received), type: row.type || told.get(row.topic)?.type || '', publishers: told.get(row.topic)?.publishers ?? row.publishers }));
   const known = new Set(rows.map((row) => row.topic));
   for (const [topic, { type, publishers }] of told) if (!known.has(topic)) rows.push({ topic, type, publishers, isLogged: false });
   // What has a publisher comes first, and of that what can be drawn, then what is logged.
@@ -65,7 +65,7 @@ export function TopicTable({ figures, now }) {
   const cell = (row, name) => {
     const own = measured.value[row.topic];
     if (name === 'rate') return (row.rate_hz || own?.hz)?.toFixed(1) ?? '–';
-    if (name === 'size') return own ? volume(own.bytes) : '–';
+    if (name === 'size') return volume(own?.bytes ?? row.size);
     if (name === 'age' && !row.isLogged) return own && now.value !== null ? (Math.max(0, now.value - own.at) / 1e3).toFixed(1) : '–';
     if (name === 'age') return html`<${TopicAge} row=${row} figures=${figures} now=${now} />`;
     if (name === 'missed' && row.missed === null && row.missed_estimated !== null) return html`~${digits(row.missed_estimated)}`;
@@ -80,7 +80,7 @@ export function TopicTable({ figures, now }) {
         const isOpen = inspected.value === row.topic;
         return [html`<tr key=${row.topic} class=${row.publishers === 0 ? 'silent' : ''}><td><${Mark} kind=${kind} why=${why} /></td>
           <td><button type="button" class="topic" aria-expanded=${isOpen} data-inspect=${row.topic} title="Show the newest message" onClick=${() => { inspected.value = isOpen ? null : row.topic; }}><b>${row.topic}</b></button>
-            <small>${row.publishers === 0 ? 'no publisher · ' : row.isLogged ? `${row.sensor || '–'} · ` : 'not logged · '}<span title=${row.type}>${row.type.split('/').at(-1)}</span></small>
+            <small>${row.publishers === 0 ? 'no publisher' : row.isLogged ? row.sensor || '–' : 'not logged'}${row.type && html` · <span title=${row.type}>${row.type.split('/').at(-1)}</span>`}</small>
             ${row.stamps && html`<small class="stamps" data-topic=${row.topic} data-field="stamps" title="How the stamps of its messages differ from the times at which they arrived">${row.stamps}</small>`}</td>
           ${COLUMNS.map(([name, , what]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) && unseen(row.topic) !== 0 ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name} title=${what}>${cell(row, name)}</td>`)}</tr>`,
         isOpen && html`<tr key=${`${row.topic}#`} class="inspected"><td></td><td colspan=${COLUMNS.length + 1}><${Message} key=${row.topic} topic=${row.topic} /></td></tr>`];

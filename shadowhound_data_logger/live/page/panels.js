@@ -231,9 +231,10 @@ export function Chart({ title, kind, lines, options, className = '', figure }) {
   }, []);
   const last = ringOf(kind).last();
   const told = ringOf(kind).names;
+  const blank = lines && told.length && !lines.some(([name]) => Number.isFinite(last[name])) ? `${chosen(kind) ?? 'The topic'} has no such value.` : '';
   return html`<${Panel} title=${title} kind=${kind} className=${`chart ${className}`}><div class="legend small">
-    ${(lines ?? []).map(([name, label, factor], place) => (!told.length || told.includes(name)) && html`<span draggable="true" title=${`${DEFINITIONS[name] ?? name}. Drag it onto another plot to compare.`} onDragStart=${(event) => drag(event, { kind, name, label, factor, unit: options.units?.[place] ?? options.unit })}><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
-    ${!lines && html`<span title="Angles of all joints, as the robot publishes them">${ringOf(kind).names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div><${Why} kind=${kind} /></${Panel}>`;
+    ${(lines ?? []).map(([name, label, factor], place) => (!told.length || told.includes(name)) && html`<span draggable="true" title=${`${DEFINITIONS[name] ?? name}. Drag it onto another plot to compare.`} onDragStart=${(event) => drag(event, { kind, name, label, factor, unit: options.units?.[place] ?? options.unit })}><i class=${`stroke line-${place + 1}`}></i>${label} <b>${Number.isFinite(last[name]) ? (last[name] * factor).toFixed(options.digits ?? 1) : '–'}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
+    ${!lines && html`<span title="Angles of all joints, as the robot publishes them">${figure(ringOf(kind).names.length)}</span>`}</div><div class="plot" ref=${box}></div><${Why} kind=${kind} also=${blank} /></${Panel}>`;
 }
 
 // A number of a topic, by its path, as the operator chose it in a message.
@@ -341,10 +342,10 @@ const HEAT = [['body', 'body', 1], ['motor', 'warmest motor', 1], ['cells', 'cel
 const chart = (title, kind, lines, options, more = {}) => [title, [kind], () => html`<${Chart} title=${title} kind=${kind} lines=${lines} options=${options} ...${more} />`];
 // Title, kinds of topics by which it is shown unless it was chosen or hidden (none: always), what it is.
 const PANELS = [
-  ['3D view', [], () => html`<${Cloud} />`], ['Path', [], () => html`<${Plan} />`],
+  ['3D view', [], () => html`<${Cloud} />`], ['Path', ['odom', 'cloud', 'scan', 'map', 'tf'], () => html`<${Plan} />`],
   ['GPS', ['fix'], () => html`<${Gps} />`],
   chart('Attitude', 'imu', ATTITUDE, { unit: '°' }), chart('Acceleration', 'imu', FORCE, { unit: 'm/s²' }),
-  chart('Joints', 'joints', null, { unit: 'rad' }, { figure: 'joints, rad' }),
+  chart('Joints', 'joints', null, { unit: 'rad' }, { figure: (count) => `${count} ${count === 1 ? 'joint' : 'joints'}, rad` }),
   chart('Battery', 'battery', POWER, { unit: '%', units: ['%', 'V'], seconds: 600 }), chart('Temperature', 'battery', HEAT, { unit: '°C', seconds: 600, digits: 0 }),
   ['Diagnostics', ['diagnostics'], () => html`<${Diagnostics} />`, true], ['Log', ['rosout'], () => html`<${Log} />`, true],
 ];

@@ -277,6 +277,7 @@ export class CloudView {
       const { model, meshes, links } = modelOf(xml);
       this.model?.removeFromParent();
       this.model = model;
+      this.robot.visible = true; // a robot without odometry and transforms, such as an arm, stands at the origin
       this.note('model', meshes ? `the model of ${links} links: meshes are files on the robot, which a page cannot fetch; joints are drawn instead` : '');
     } catch (error) {
       this.model = null;

@@ -67,7 +67,7 @@ export function pick(kind, topic) {
 
 // Whether the robot is one of Unitree's dogs, as far as its topics tell.
 const GO2 = /^(go2_interfaces|unitree_go)\//;
-export const isGo2 = computed(() => topics.value.some(([, , type]) => GO2.test(type)) || (figures.value?.topics ?? []).some(({ type }) => GO2.test(type))
+export const isGo2 = computed(() => topics.value.some(([, , type, publishers]) => publishers > 0 && GO2.test(type)) || (figures.value?.topics ?? []).some(({ type, received }) => received > 0 && GO2.test(type))
   || (past.value?.shown ?? []).some(([topic]) => /go2|lowstate|utlidar/.test(topic)));
 
 const watched = new Map(); // panel -> what gives the topics that it needs
@@ -92,8 +92,8 @@ export function useWatch(kinds, more = () => []) {
 }
 
 const NAMES = {
-  camera: 'sensor_msgs/CompressedImage or Image', cloud: 'sensor_msgs/PointCloud2', odom: 'nav_msgs/Odometry', imu: 'sensor_msgs/Imu or go2_interfaces/IMU',
-  joints: 'sensor_msgs/JointState', battery: 'sensor_msgs/BatteryState or go2_interfaces/LowState', fix: 'sensor_msgs/NavSatFix',
+  camera: 'sensor_msgs/CompressedImage or Image', cloud: 'sensor_msgs/PointCloud2', odom: 'nav_msgs/Odometry', imu: 'sensor_msgs/Imu',
+  joints: 'sensor_msgs/JointState', battery: 'sensor_msgs/BatteryState', fix: 'sensor_msgs/NavSatFix',
   diagnostics: 'diagnostic_msgs/DiagnosticArray', rosout: 'rcl_interfaces/Log', scan: 'sensor_msgs/LaserScan', map: 'nav_msgs/OccupancyGrid',
 };
 

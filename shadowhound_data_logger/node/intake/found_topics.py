@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from math import inf
 from typing import Final
 
 from rclpy.node import Node
@@ -14,6 +15,7 @@ from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.options import AUTO, DEFAULT_SENSORS
 from shadowhound_data_logger.core.type_rules import NOT_LOGGED, RULES, is_of_unitree, not_logged, sensor_for
 from shadowhound_data_logger.node.intake.consumers import is_plain_name
+from shadowhound_data_logger.ros.endpoints import Endpoint, alternatives
 from shadowhound_data_logger.ros.reader import endpoints
 
 log = logging.getLogger(__name__)
@@ -46,17 +48,23 @@ def robots_in(topics: Collection[str], own: str) -> list[str]:
 
 
 class FoundTopics:
-    """Finds topics to log. New; ``poll`` at each check of the graph."""
+    """Finds topics to log. New; ``poll`` at each check of the graph.
 
-    def __init__(self, node: Node, which: str, named: Collection[str]) -> None:
-        """``which`` is ``capture.topics``; ``named`` are full names of the topics that sensors name."""
+    The default sensors are for a Unitree. On another robot those that its topics do not need are removed, and added again when
+    one of their topics is published.
+    """
+
+    def __init__(self, node: Node, which: str, sensors: Sequence[SensorSettings], assumed: Collection[str]) -> None:
+        """``which`` is ``capture.topics``; ``sensors`` are those of the settings, which do not mention the ``assumed`` ones."""
         self._node = node
         self._is_auto = which == AUTO
-        self._named = frozenset(named)
+        self._topics = {sensor.name: [str(node.resolve_topic_name(topic)) for topic in sensor.topics] for sensor in sensors}
+        self._assumed = assumed
+        self._removed: dict[str, SensorSettings] = {}
         self._seen: set[str] = set()
         self._namespace = f'{node.get_namespace().rstrip("/")}/'
-        self._since_s: float | None = None
-        self._is_unitree = self._has_warned = False
+        self._since_s = self._published_since_s = inf
+        self._is_unitree = self._is_of_another = self._has_warned = self._has_removed = False
         self._count = 0
         self.not_logged: Mapping[str, str] = {}
         """Topic -> why it is not logged. Replaced atomically."""
@@ -64,21 +72,25 @@ class FoundTopics:
     def poll(self, sensors: Mapping[str, SensorSettings], now_s: float) -> Iterator[SensorSettings]:
         """The sensors to add. A topic is decided once, from its publishers when it is first seen."""
         graph = {name: types for name, types in self._node.get_topic_names_and_types() if is_plain_name(name)}
-        self._since_s = now_s if self._since_s is None else self._since_s
-        self._is_unitree = self._is_auto and (self._is_unitree or is_unitree(self._node, graph))
+        self._since_s = min(self._since_s, now_s)
+        self._is_unitree = self._is_unitree or is_unitree(self._node, graph)
+        if self._published_since_s == inf and any(map(self._publishers_of, self._own(graph))):
+            self._published_since_s = now_s
+        self._is_of_another = not self._is_unitree and now_s - self._published_since_s >= SETTLE_S
+        yield from self._returning(sensors, graph)
         has_settled = now_s - self._since_s >= SETTLE_S
         if has_settled and not self._has_warned:
             self._warn_of_robots(graph)
         if not has_settled:
             return
         left_out = dict(self.not_logged)
-        for topic in sorted(filter(self._is_own, graph.keys() - self._named - self._seen - NOT_LOGGED)):
-            publishers = [each for each in endpoints(self._node, topic) if not each.node or each.node != self._own_name]
+        for topic in sorted(self._own(graph).difference(self._named, self._seen)):
+            publishers = self._publishers_of(topic)
             if not publishers:
                 continue
             self._seen.add(topic)
             type_name = publishers[0].type
-            if self._is_unitree and not (is_of_unitree(type_name) and type_name in RULES):
+            if self._has_default_sensors and not (is_of_unitree(type_name) and type_name in RULES):
                 continue
             latched = all(each.transient_local for each in publishers)
             sensor = sensor_for(topic, type_name, sensors.keys(), is_latched=latched)
@@ -91,10 +103,55 @@ class FoundTopics:
                 log.info('%s (%s) is not logged: %s', printable(topic), type_name, why)
         self.not_logged = left_out
 
+    def may_remove(self, sensor: SensorSettings) -> bool:
+        """Whether the sensor is only there because the robot could have been a Unitree."""
+        return self._is_of_another and sensor.name in self._assumed and sensor.topics == DEFAULT_SENSORS[sensor.name]['topics']
+
+    def remove(self, sensors: Sequence[SensorSettings]) -> None:
+        """These sensors were removed."""
+        self._removed.update((sensor.name, sensor) for sensor in sensors)
+        if not self._has_removed:
+            self._has_removed = True
+            topics = ' '.join(topic for sensor in sensors if sensor.enabled for topic in self._topics[sensor.name])
+            log.info('this is not a Unitree: until they are published, %s are not subscribed to', topics)
+
+    def update(self, sensors: Iterable[SensorSettings]) -> None:
+        """Apply other settings to sensors that are removed."""
+        self._removed.update((sensor.name, sensor) for sensor in sensors if sensor.name in self._removed)
+
+    def _returning(self, sensors: Mapping[str, SensorSettings], graph: Mapping[str, Collection[str]]) -> Iterator[SensorSettings]:
+        """The removed sensors to add again."""
+        for name, sensor in tuple(self._removed.items()):
+            if name not in sensors and (self._is_unitree or (sensor.enabled and self._is_published(sensor, graph))):
+                del self._removed[name]
+                yield sensor
+
+    def _is_published(self, sensor: SensorSettings, graph: Mapping[str, Collection[str]]) -> bool:
+        """Whether one of its topics has a publisher of the type that it expects."""
+        pairs = zip(self._topics[sensor.name], sensor.types, strict=True)
+        return any(
+            publisher.type in alternatives(types)
+            for topic, types in pairs if topic in graph and topic not in self._seen
+            for publisher in self._publishers_of(topic)
+        )  # fmt: skip
+
     @property
-    def is_of_another_robot(self) -> bool:
-        """Whether it has been looked for a Unitree, and none was found: the default sensors are for one."""
-        return self._is_auto and not self._is_unitree and bool(self._seen)
+    def _named(self) -> frozenset[str]:
+        """The topics of sensors of the settings, without those that are removed."""
+        return frozenset(topic for name, topics in self._topics.items() if name not in self._removed for topic in topics)
+
+    @property
+    def _has_default_sensors(self) -> bool:
+        """Whether the default sensors are for this robot, and what is logged of it."""
+        return self._is_auto and self._is_unitree
+
+    def _own(self, graph: Mapping[str, Collection[str]]) -> set[str]:
+        """The topics of this robot."""
+        return {topic for topic in graph.keys() - NOT_LOGGED if self._is_own(topic)}
+
+    def _publishers_of(self, topic: str) -> list[Endpoint]:
+        """Without this node itself."""
+        return [each for each in endpoints(self._node, topic) if not each.node or each.node != self._own_name]
 
     def _is_own(self, topic: str) -> bool:
         """Whether it belongs to this robot: below the namespace of the node, or tf, which several robots share."""
@@ -103,8 +160,9 @@ class FoundTopics:
     def _warn_of_robots(self, graph: Mapping[str, list[str]]) -> None:
         """Log once: topics of robots in namespaces that this node does not log, or logs under one name."""
         robots = robots_in(graph, self._node.get_namespace())
-        is_mixed = len(robots) > 1 and not self._is_unitree
-        if is_mixed or (robots and self._is_unitree and not any(map(self._node.count_publishers, self._named & graph.keys()))):
+        is_mixed = len(robots) > 1 and not self._has_default_sensors
+        is_elsewhere = self._has_default_sensors and not any(map(self._node.count_publishers, self._named & graph.keys()))
+        if is_mixed or (robots and is_elsewhere):
             self._has_warned = True
             what = 'are logged under one name' if is_mixed else 'are not logged'
             launch = (

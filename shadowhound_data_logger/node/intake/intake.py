@@ -144,7 +144,7 @@ class Intake:
         todo: list[Callable[[], None]] = []
         if refreshes := now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
-            todo += [partial(self._find, now_s), *(partial(subscriber.refresh, now_s) for subscriber in self._by_turn)]
+            todo += [*(partial(subscriber.refresh, now_s) for subscriber in self._by_turn), partial(self._find, now_s)]
         if refreshes and self._early is not None:  # after the first check of the graph
             todo.append(self._early.close)
             self._early = None
@@ -156,13 +156,24 @@ class Intake:
         _each([*todo, self._requests.handle])
 
     def _find(self, now_s: float) -> None:
-        """Add sensors for topics that the settings do not name; they are subscribed to at the next refresh."""
-        for sensor in self.found.poll(self._sensors, now_s) if self.found is not None else ():
+        """Add sensors for topics that the settings do not name, and remove those of a robot that this is not."""
+        if self.found is None:
+            return
+        for sensor in self.found.poll(self._sensors, now_s):
             self._sensors[sensor.name] = sensor
             subscriber = Subscriber(self._context, sensor, self.consumers, self._others)
             subscriber.paused = self.paused
             self._subscribers = (*self._subscribers, subscriber)
             self._by_turn = self._in_turn()
+            subscriber.refresh(now_s)
+        unused = [one for one in self._subscribers if one.is_unused and self.found.may_remove(one.sensor)]
+        if unused:
+            self._subscribers = tuple(one for one in self._subscribers if one not in unused)
+            self._by_turn = self._in_turn()
+            for one in unused:
+                del self._sensors[one.sensor.name]
+            self.found.remove([one.sensor for one in unused])
+            _each([partial(one.close, now_s) for one in unused])
 
     def _in_turn(self) -> list[Subscriber]:
         return sorted(self._subscribers, key=lambda subscriber: not self._is_first(subscriber.sensor))
@@ -176,7 +187,12 @@ class Intake:
 
     def _update(self, sensors: Sequence[SensorSettings]) -> None:
         now_s = time.monotonic()
-        self._sensors.update((sensor.name, sensor) for sensor in sensors)
+        if self.found is not None:
+            self.found.update(sensors)
+        for sensor in sensors:
+            present = self._sensors.get(sensor.name)
+            if present is not None and present.topics == sensor.topics:  # not one that was found, of the same name
+                self._sensors[sensor.name] = sensor
         _each([partial(subscriber.update, self._sensors[subscriber.sensor.name], now_s) for subscriber in self._subscribers])
         self._next_refresh_s = now_s
 

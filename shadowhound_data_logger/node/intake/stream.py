@@ -206,11 +206,19 @@ class SensorStream:
         self._arrivals = Arrivals()
         self._counter: CounterField | None = None
         self._is_refuted = False
-        with self._accounts.entry(self._topic) as account:
-            account.type = type_name
-            account.estimate.expect(self._expected(sensor, types))
+        self._expectation = self._expected(sensor, types)
+        self._is_begun = False
         for consumer in self._sensor_consumers:
             consumer.enter(topic, type_name, sensor.name)
+
+    def begin(self) -> None:
+        """Open the account of the topic, which has a publisher; idempotent."""
+        if self._is_begun:
+            return
+        self._is_begun = True
+        with self._accounts.entry(self._topic) as account:
+            account.type = self._type
+            account.estimate.expect(self._expectation)
 
     def _expected(self, sensor: SensorSettings, types: MessageTypes) -> Expectation:
         """The expected messages of the sensor: a counter in them, otherwise their rate."""
@@ -228,6 +236,7 @@ class SensorStream:
         unnumbered: dict[str, list[int]] = {}
         counter, date = self._counter, self._times.date
         failed: dict[Consumer, Exception] = {}
+        self.begin()
         with self._accounts.entry(self._topic) as account:
             for message in taken:
                 cdr, source_ns, gid, number, *_ = message

@@ -75,6 +75,8 @@ class SubscriberStatus:
     """Whether silence is normal: kept on change only, or all publishers are latched."""
     unavailable: str = ''
     """Why it cannot be subscribed to here; empty if it can."""
+    size: int | None = None
+    """Bytes of the last message; None before the first."""
 
 
 class OtherTypes:
@@ -223,6 +225,7 @@ class Subscriber:
         """Whether messages are only counted."""
         self._last_taken_s: float | None = None
         self._last_received_s: float | None = None
+        self._last_size: int | None = None
         self._unavailable = ''
         self._logged: set[str] = set()
         self._nameless_since_s: float | None = None
@@ -233,6 +236,11 @@ class Subscriber:
         return self._chosen
 
     @property
+    def is_unused(self) -> bool:
+        """Whether its topics have no publisher of its types, and no message of them was received."""
+        return not self._publishers and self._last_received_s is None
+
+    @property
     def wanted(self) -> dict[str, str]:
         """Its topics in order of preference, with the type that the settings name for each, or ''."""
         expected = {topic: alternatives(self._types_expected.get(topic, '')) for topic in self._topics}
@@ -241,7 +249,8 @@ class Subscriber:
     def status(self) -> SubscriberStatus:
         """From any thread: each value is replaced atomically."""
         return SubscriberStatus(self.sensor.name, self._chosen, self.sensor.enabled, self._publishers, self._last_received_s,
-                            self._matched, self.sensor.on_change or self.is_latched, self._unavailable)  # fmt: skip
+                            self._matched, self.sensor.on_change or self.is_latched, self._unavailable,
+                                self._last_size)  # fmt: skip
 
     def refresh(self, now_s: float) -> None:
         """Check the graph and subscribe to match its publishers."""
@@ -266,6 +275,8 @@ class Subscriber:
         for plan in wanted:
             if plan not in present and not self._subscribe(plan):
                 return
+        if publishers and isinstance(self._stream, SensorStream):
+            self._stream.begin()
         if publishers and set(wanted) != self._received:
             self._received = set(wanted)
             log.info('%s: %s', self.sensor.name, ' and '.join(plan.describe() for plan in wanted))
@@ -426,6 +437,7 @@ class Subscriber:
         since_s = POLL_S if before_s is None else now_s - before_s
         self._history.observe([len(message.cdr) for message in taken], since_s)
         last_s, self._last_taken_s = self._last_taken_s, now_s
+        self._last_size = len(taken[-1].cdr)
         self._last_received_s = now_s - _waited_s(taken[-1].received_ns, since_s)
         is_unnamed = taken[0].publisher is None or taken[0].number is None
         if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):

@@ -177,11 +177,7 @@ class Status:
         totals = self._stages.spool.accounts.totals()
         sources = {source.topic: source for source in self._stages.intake.status()}
         topics = dict.fromkeys((*sources, *totals))
-        rows = {topic: self._topic(topic, sources.get(topic), totals.get(topic, _NOTHING), now_s) for topic in topics}
-        found = self._stages.intake.found
-        if found is None or not found.is_of_another_robot:
-            return rows
-        return {topic: row for topic, row in rows.items() if row.publishers or row.received}
+        return {topic: self._topic(topic, sources.get(topic), totals.get(topic, _NOTHING), now_s) for topic in topics}
 
     def _topic(self, topic: str, source: SubscriberStatus | None, totals: Totals, now_s: float) -> TopicStatus:
         rate_hz = 0.0
@@ -196,7 +192,7 @@ class Status:
         age_s = None if source.received_s is None else round(max(0.0, now_s - source.received_s), 3)
         return TopicStatus(**fields_of(totals), sensor=source.sensor, enabled=source.enabled, publishers=source.publishers,
                            matched=source.matched, may_be_silent=source.may_be_silent, unavailable=source.unavailable,
-                           rate_hz=rate_hz, age_s=age_s)  # fmt: skip
+                           rate_hz=rate_hz, age_s=age_s, size=source.size)  # fmt: skip
 
     def _middleware(self, now_s: float) -> MiddlewareStatus:
         """Its sockets are queried less often: that takes a third of the time of the complete status."""

@@ -40,7 +40,7 @@ class Intake:
     def __init__(self) -> None:
         self.paused = False
         self.worker = Worker('intake', lambda: None)
-        self.found = SimpleNamespace(not_logged={'/led': 'no rule'}, is_of_another_robot=False)
+        self.found = SimpleNamespace(not_logged={'/led': 'no rule'})
         self.consumers = [Sampler()]
         self.sources = [SubscriberStatus('imu', '/imu', enabled=True, publishers=1, received_s=None)]
 
@@ -139,16 +139,6 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
     made = Setting(tmp_path)
     yield made
     made.spool.close()
-
-
-def test_topics_of_a_unitree_are_not_missed_on_another_robot(setting: Setting) -> None:
-    """A topic of a default sensor is listed there once it has a publisher; on a Unitree it is always listed."""
-    setting.intake.sources.append(SubscriberStatus('lowstate', '/lowstate', enabled=True, publishers=0, received_s=None))
-    assert list(setting.poll().topics) == ['/imu', '/lowstate']
-    setting.intake.found.is_of_another_robot = True
-    assert list(setting.poll().topics) == ['/imu']
-    setting.intake.sources[-1] = replace(setting.intake.sources[-1], publishers=1)
-    assert list(setting.poll().topics) == ['/imu', '/lowstate']
 
 
 def test_a_topic_before_and_after_its_first_message(setting: Setting) -> None:
