@@ -32,7 +32,7 @@ ERROR = 'Tower at http://192.168.10.20:9000 refused the connection (is it on, an
 def a_topic(**figures: Any) -> dict[str, Any]:
     row = {
         'sensor': 'imu', 'type': 'x/msg/Y', 'enabled': True, 'publishers': 1, 'matched': 1, 'may_be_silent': False,
-        'unavailable': '', 'rate_hz': 99.84, 'age_s': 0.02, 'received': 1200,
+        'unavailable': '', 'rate_hz': 99.84, 'age_s': 0.02, 'size': 324, 'received': 1200,
         'stored': 1100, 'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': 0, 'open': 100, 'accounting': 'exact',
         'missed_estimated': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0,
         'by_arrival': {}, 'corrected': {}, 'stamps': None,
