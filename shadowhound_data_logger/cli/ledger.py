@@ -44,7 +44,7 @@ from shadowhound_data_logger.spool.ledger import (
 )
 from shadowhound_data_logger.spool.ledger import read as read_ledger
 from shadowhound_data_logger.spool.local_robot import local_robots, robots
-from shadowhound_data_logger.spool.status import listed_topics, not_logged
+from shadowhound_data_logger.spool.status import not_logged
 from shadowhound_data_logger.spool.topic_account import GRADES, RECEIVED_ONLY
 
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
@@ -104,11 +104,9 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
     if again:
         raise BadUsage('--again is for --verify and --deep', 'add --verify')
     names, robot = robots(folder), _robot(folder)
-    figures, listed = read_ledger(folder, robot), listed_topics(folder, robot)
     found: LedgerPage = {
-        **figures,
+        **read_ledger(folder, robot),
         'not_logged': dict(not_logged(folder, robot)),
-        'silent': [name for name, row in figures['topics'].items() if _is_silent(row) and (listed is None or name in listed)],
         'robots': names if len(names) > 1 else [robot],  # a spool that several share has one ledger of them all
     }
     if as_json:
@@ -164,8 +162,6 @@ class LedgerPage(SpoolLedger):
 
     not_logged: dict[str, str]
     """Topics that the node found and does not log, and why."""
-    silent: list[str]
-    """Topics of the robot's sensors without a single message received."""
     robots: list[str]
 
 
@@ -254,8 +250,8 @@ def notes(found: LedgerPage) -> list[str]:
         lines += [f'{topic}: {_other_type(name, other)}' for name, other in row['other_types'].items()]
         if row['accounting'] in ACCOUNTING:
             lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
-    if found['silent']:
-        lines.append(f'no message was received of {", ".join(found["silent"])}')
+    if silent := [topic for topic, row in found['topics'].items() if _is_silent(row)]:
+        lines.append(f'no message was received of {", ".join(silent)}')
     lines += [f'{topic}: not logged: {why}' for topic, why in found['not_logged'].items()]
     return [*lines, *clock_notes(found['clock'])]
 

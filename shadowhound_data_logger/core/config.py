@@ -221,12 +221,6 @@ def default_robot(environ: Mapping[str, str], namespace: str = '/') -> str:
     return re.sub(r'[^A-Za-z0-9_-]', '_', socket.gethostname()).strip('_-') or 'robot'
 
 
-def has_go2_messages(environ: Mapping[str, str]) -> bool:
-    """Whether the messages of a Go2 are installed, as on its computer."""
-    shares = [Path(prefix) / 'share' for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix]
-    return any((share / package).is_dir() for share in shares for package in GO2_PACKAGES)
-
-
 def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:
     """The parameter, otherwise SHADOWHOUND_ROBOT, otherwise ``default_robot``."""
     if not isinstance(given, str):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -90,11 +90,6 @@ def targets(spool: Path) -> list[str]:
 def not_logged(spool: Path, robot: str) -> Mapping[str, str]:
     """Topics that the node of a robot found and did not log when it last wrote its status, and why."""
     return _written(spool, robot)[0].not_logged
-
-
-def listed_topics(spool: Path, robot: str) -> Collection[str] | None:
-    """The topics in the last status of the node of a robot; None without one. Other default sensors are not for this robot."""
-    return _written(spool, robot)[0].topics or None
 
 
 def limits(spool: Path, own: SpoolSettings) -> SpoolSettings:

@@ -51,7 +51,7 @@ def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
     return {
         'robot': 'thor', 'balanced': balanced, 'topics': named, 'bags': {}, 'events': {}, 'objects': counts, 'bytes': counts,
         'clock': {'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 0}, 'operator_requests': [],
-        'not_logged': {}, 'silent': [], 'robots': ['thor'],
+        'not_logged': {}, 'robots': ['thor'],
     }  # fmt: skip
 
 
@@ -230,24 +230,9 @@ def test_the_verdict_is_about_what_was_received_where_something_is_not_logged(un
 def test_a_topic_without_messages() -> None:
     """It is named below the table."""
     never = a_topic(accounting=None, received=0, published=None, missed=None, stored=0, skipped=0, by_grade={})
-    text = shown({**a_ledger(imu=never, odom=a_topic()), 'silent': ['/imu']})
+    text = shown(a_ledger(imu=never, odom=a_topic()))
     assert not any(line.startswith('/imu') for line in text.splitlines())
     assert 'no message was received of /imu' in text
-
-
-def test_sensors_of_another_robot_are_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a message, only topics that the node lists in its status are named; without a status all of them."""
-    never = a_topic(accounting=None, received=0, published=None, missed=None, stored=0, skipped=0, by_grade={})
-    monkeypatch.setattr('shadowhound_data_logger.cli.ledger.read_ledger', lambda *_: a_ledger(imu=never, lowstate=never))
-    spool = new_spool(tmp_path)
-    spool.open()
-    spool.close()
-    silent = []
-    for topics in ({}, {'/imu': {}}):
-        (tmp_path / 'status-thor.json').write_text(json.dumps({'robot': 'thor', 'topics': topics}))
-        answer = CliRunner().invoke(ledger, ['--spool', str(tmp_path), '--json'], standalone_mode=False)
-        silent.append(json.loads(answer.stdout)['silent'])
-    assert silent == [['/imu', '/lowstate'], ['/imu']]
 
 
 def test_what_does_not_balance_is_named() -> None:
