@@ -31,7 +31,7 @@ from _report import Bar, Report, main, progress
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows.schema import BUCKET, FORMAT_VERSION, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, FORMAT_VERSION, OBJECTS, TableSchema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.formats.statistics import FieldStatistics, numbers_of
 from shadowhound_data_logger.lake import search, values

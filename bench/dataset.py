@@ -32,7 +32,7 @@ from torch.utils.data import DataLoader
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.formats.archive import ArchiveFile, pack_tar
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake import MissionDataset
 from shadowhound_data_logger.lake.bucket import Bucket
 
@@ -73,14 +73,14 @@ def fill(store: S3Store, bodies: Sequence[bytes]) -> int:
         list(pool.map(lambda put: obstore.put(store, put[0], put[1]), puts))
     for robot in ('thor', 'tachi'):
         rows = [
-            schema.row_of(schema.BUCKET, key, len(body), 'image/jpeg', report)
+            catalog.row_of(catalog.BUCKET, key, len(body), 'image/jpeg', report)
             for key, body, report in puts
             if key.startswith(robot)
         ]
         for start in range(0, len(rows), 60):
             name = f'{utc(rows[start]["t_start_ns"]):%Y%m%dT%H%M%S}_b'
             obstore.put(
-                store, schema.OBJECTS.part_key(robot, schema.date_of(rows[start]), name), parts.encode(rows[start : start + 60])
+                store, catalog.OBJECTS.part_key(robot, catalog.date_of(rows[start]), name), parts.encode(rows[start : start + 60])
             )
     return sum(map(len, bodies))
 
@@ -98,17 +98,17 @@ def guide(settings: Any, folder: Path) -> int:
     s3 = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
                       aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
     files: list[Path] = []
-    for page in s3.get_paginator('list_objects_v2').paginate(Bucket=schema.BUCKET, Prefix='thor/camera/'):
+    for page in s3.get_paginator('list_objects_v2').paginate(Bucket=catalog.BUCKET, Prefix='thor/camera/'):
         for found in page.get('Contents', []):
             path = folder / found['Key']
             path.parent.mkdir(parents=True, exist_ok=True)
-            s3.download_file(schema.BUCKET, found['Key'], str(path))
+            s3.download_file(catalog.BUCKET, found['Key'], str(path))
             files.append(path)
     return sum(np.asarray(Image.open(path)).shape == (480, 640, 3) for path in files)
 
 
 def ours(settings: Any, robot: str, *, by_number: bool, workers: int = WORKERS, context: str = 'fork') -> int:
-    source = Bucket(settings, schema.BUCKET)
+    source = Bucket(settings, catalog.BUCKET)
     dataset = MissionDataset(source, robot=robot)
     how: dict[str, Any] = {'batch_size': BATCH, 'num_workers': workers}
     if workers:
@@ -126,7 +126,7 @@ def measure(options: argparse.Namespace) -> Report:
     with Tower(folder / 'tower') as tower:
         settings = tower.store_settings()
         make_bucket(tower)
-        bare = S3Store(schema.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
+        bare = S3Store(catalog.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
                        region=settings.region, secret_access_key=settings.secret_access_key, virtual_hosted_style_request=False,
                        client_options={'allow_http': True})  # fmt: skip
         pictures = [picture(number) for number in range(16)]

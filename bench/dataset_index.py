@@ -20,7 +20,7 @@ from typing import Final
 from _report import Bar, Report, main, progress
 
 from shadowhound_data_logger.core.clock import SECOND, utc
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 
 FIRST_NS: Final = 1_793_188_800 * SECOND
 HOUR: Final = 3600
@@ -52,9 +52,9 @@ def fill(folder: Path, first: int, last: int) -> None:
             report = {'robot': 'thor', 'sensor': 'camera', 'topic': '/camera/compressed', 'type': KIND, 'count': '1',
                     't_start_ns': str(stamp), 't_end_ns': str(stamp), 'sha256': hashlib.sha256(key.encode()).hexdigest(),
                     'pose': f'{second}.0 2.0 0.5 odom', 'battery_pct': '80'}  # fmt: skip
-            rows.append(schema.row_of(schema.BUCKET, key, 45_000, 'image/jpeg', report))
+            rows.append(catalog.row_of(catalog.BUCKET, key, 45_000, 'image/jpeg', report))
         name = f'{utc(rows[0]["t_start_ns"]):%Y%m%dT%H%M%S}_b'
-        part = folder / schema.OBJECTS.part_key('thor', schema.date_of(rows[0]), name)
+        part = folder / catalog.OBJECTS.part_key('thor', catalog.date_of(rows[0]), name)
         part.parent.mkdir(parents=True, exist_ok=True)
         part.write_bytes(parts.encode(rows))
 

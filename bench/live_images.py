@@ -33,7 +33,7 @@ from lake.making import add, add_part, folder_store, row
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.options import UploadSettings
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, complete, date_of, statement
 from shadowhound_data_logger.stores import open_store
 
@@ -110,8 +110,8 @@ def fleet(browser: Browser, folder: Path, to: Path) -> None:
             at_ns = now_ns - ago_s * SECOND
             rows = [row('camera', at_ns - second * SECOND, name, mission_id=f'patrol_{name}', mission_type='patrol')
                     for second in range(60)]  # fmt: skip
-            for date in sorted(set(map(schema.date_of, rows))):
-                add_part(store, [one for one in rows if schema.date_of(one) == date], 'a', folder / 'tmp')
+            for date in sorted(set(map(catalog.date_of, rows))):
+                add_part(store, [one for one in rows if catalog.date_of(one) == date], 'a', folder / 'tmp')
             reported = [complete(name, 'j', 1, from_ns=at_ns - 60 * SECOND, to_ns=at_ns, received=3000, skipped=0, **IMU)]
             if lost:
                 reported.append(statement(

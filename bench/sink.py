@@ -26,7 +26,7 @@ from lake import rows
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake.bucket import put_part
 from shadowhound_data_logger.stores import open_store
 
@@ -45,7 +45,7 @@ def fill(folder: Path, days: int) -> int:
         for hour in range(days * HOURS):
             made = [row for minute in range(hour * 60, hour * 60 + 60) for row in rows(minute)]
             stamp = utc(made[0]['t_start_ns'])
-            key = schema.OBJECTS.part_key('thor', f'{stamp:%Y-%m-%d}', f'{stamp:%Y%m%dT%H}0000_b007')
+            key = catalog.OBJECTS.part_key('thor', f'{stamp:%Y-%m-%d}', f'{stamp:%Y%m%dT%H}0000_b007')
             put_part(store, key, 'thor', parts.encode(made), len(made))
             count += len(made)
             if hour % HOURS == HOURS - 1:

@@ -37,7 +37,7 @@ from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.config import store_settings
 from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP, CLOCKS
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.live.history import PastReader

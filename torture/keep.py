@@ -40,7 +40,7 @@ from shadowhound_data_logger.core.model import LOST
 from shadowhound_data_logger.formats.mcap.index import read_index
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Ranged, StoredFile
-from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS
+from shadowhound_data_logger.formats.rows.catalog import KEPT, OBJECTS
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

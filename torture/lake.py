@@ -28,7 +28,7 @@ from shadowhound_data_logger import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import DataLoggerError
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import ingest
@@ -77,7 +77,7 @@ class Writer(threading.Thread):
         """Keys of objects whose rows are in the store; it only grows."""
 
     def run(self) -> None:
-        before: dict[str, list[schema.Row]] = {}
+        before: dict[str, list[catalog.Row]] = {}
         number = 0
         with closing(open_store(self._tower.store_settings(), UploadSettings())) as store:
             while not self.over.is_set():
@@ -108,7 +108,7 @@ class Campaign:
         with Tower(self._folder / 'tower') as tower:
             self._make_buckets(tower)
             os.environ.update(tower.environment(), SHADOWHOUND_HOME=str(self._folder / 'home'))
-            source = Bucket(tower.store_settings(), schema.BUCKET)
+            source = Bucket(tower.store_settings(), catalog.BUCKET)
             Tables.for_ingest(source)
             writer = Writer(tower, self._folder / 'work')
             writer.start()
@@ -159,7 +159,7 @@ class Campaign:
         settings = tower.store_settings()
         client = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
                               aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
-        for name in (schema.BUCKET, 'lake'):
+        for name in (catalog.BUCKET, 'lake'):
             client.create_bucket(Bucket=name)
         client.close()
 

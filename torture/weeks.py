@@ -47,7 +47,7 @@ from shadowhound_data_logger.core.rules import read_rule
 from shadowhound_data_logger.formats.archive import ArchiveFile, pack_tar
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake import gaps, prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

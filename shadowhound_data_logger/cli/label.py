@@ -241,7 +241,7 @@ def _named(robot: str | None) -> str:
 
 def _place(key: str, robot: str) -> tuple[str, str]:
     """Bucket and key of an object, which may be given as BUCKET/KEY."""
-    from shadowhound_data_logger.formats.rows.schema import BUCKET  # noqa: PLC0415
+    from shadowhound_data_logger.formats.rows.catalog import BUCKET  # noqa: PLC0415
 
     bucket, _, rest = key.partition('/')
     return (BUCKET, key) if bucket == robot else (bucket, rest)

@@ -42,6 +42,15 @@ def _signs(verb: _Verb) -> _Verb:
                         )(verb)  # fmt: skip
 
 
+_robot_types = click.option(
+    '--robot-type',
+    'robot_types',
+    multiple=True,
+    default=('go2',),
+    show_default=True,
+    metavar='TYPE',
+    help='Type of robot; may be repeated.',
+)
 _key = click.option(
     '--key', type=_file, metavar='FILE', help='Private key to sign with  [default: targets.key in the folder of keys]'
 )
@@ -202,15 +211,7 @@ def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
 @click.option('--smoke', type=_file, required=True, metavar='NPZ', help='Sample arrays, one per input, for the smoke run.')
 @click.option('--dataset', default='', metavar='DIGEST', help='Digest of the training set.')
 @click.option('--run', 'run_id', default='', metavar='ID', help='MLflow run that trained it.')
-@click.option(
-    '--robot-type',
-    'robot_types',
-    multiple=True,
-    default=('go2',),
-    show_default=True,
-    metavar='TYPE',
-    help='Type of robot; may be repeated.',
-)
+@_robot_types
 @click.option(
     '--fps', type=click.FloatRange(0.01, 1000.0), default=10.0, show_default=True, metavar='N', help='Frames per second.'
 )
@@ -270,15 +271,7 @@ def publish(
 
 @click.command(epilog=examples('policy withdraw go2_patrol@7'))
 @click.argument('name', metavar='NAME@VERSION')
-@click.option(
-    '--robot-type',
-    'robot_types',
-    multiple=True,
-    default=('go2',),
-    show_default=True,
-    metavar='TYPE',
-    help='Type of robot; may be repeated.',
-)
+@_robot_types
 @_key
 @_signs
 @as_json

@@ -218,7 +218,7 @@ class RequestAnswer:
 
 
 def size_of(want: KeptFilter, row: Mapping[str, Any]) -> int:
-    """Approximate number of bytes wanted of an object, from its row of ``formats.rows.schema.KEPT``: a slice may be cut."""
+    """Approximate number of bytes wanted of an object, from its row of ``formats.rows.catalog.KEPT``: a slice may be cut."""
     begin_ns = row['t_start_ns'] or 0
     return want.bytes_of(row['key'], row['sensor'] or '', row['bytes'] or 0, begin_ns, row['t_end_ns'] or begin_ns, {})
 
@@ -246,7 +246,7 @@ class Offer:
 
 
 def offer(want: KeptFilter, rows: Iterable[Mapping[str, Any]], mbps: float | None) -> Offer:
-    """What a request for these rows of ``formats.rows.schema.KEPT`` would get; the filter selects all of them."""
+    """What a request for these rows of ``formats.rows.catalog.KEPT`` would get; the filter selects all of them."""
     objects, size, lost = 0, 0, Counter[str]()
     for row in rows:
         if row['where'] == ON_ROBOT:

@@ -16,7 +16,7 @@ UPLOAD_WHEN: Final = 'upload.when'
 EVENTS_WHEN: Final = 'events.when'
 """Settings that delay the upload of objects (``waits_for``)."""
 ON_ROBOT, LOST = 'robot', 'lost'
-"""The state of an object that a robot kept (the column ``where`` of ``formats.rows.schema.KEPT``)."""
+"""The state of an object that a robot kept (the column ``where`` of ``formats.rows.catalog.KEPT``)."""
 PREVIEWS: Final = '_previews'
 """The folder of previews, and the suffix of a preview's sensor."""
 

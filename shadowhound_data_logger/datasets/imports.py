@@ -36,7 +36,7 @@ from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.core.untrusted import csv_rows
 from shadowhound_data_logger.datasets.features import ARM_COMMANDS, ARM_JOINTS, ARM_TOPICS, JOINT_STATE
 from shadowhound_data_logger.datasets.lerobot import matrix
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake.bucket import put_part
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -247,15 +247,15 @@ def import_episodes(demonstrations: Iterable[Demonstration], arm: str, store: Ob
             found.refused[each.name] = why
             continue
         is_new = not stored.has(each)
-        rows: list[schema.Row] = []
+        rows: list[catalog.Row] = []
         for sensor, values in ((ARM_JOINTS, each.positions), (ARM_COMMANDS, each.commands)):
             if values is not None:
                 pieces = range(-(-len(values) // PART))
                 rows += [stored.put(each, sensor, number, values, found) for number in pieces]
         name = f'{utc(each.begin_ns):%Y%m%dT%H%M%S}_import_{each.identity[:DIGITS]}'
-        for date in sorted({schema.date_of(row) for row in rows}):
-            mine = [row for row in rows if schema.date_of(row) == date]
-            put_part(store, schema.OBJECTS.part_key(arm, date, name), arm, parts.encode(mine), len(mine))
+        for date in sorted({catalog.date_of(row) for row in rows}):
+            mine = [row for row in rows if catalog.date_of(row) == date]
+            put_part(store, catalog.OBJECTS.part_key(arm, date, name), arm, parts.encode(mine), len(mine))
         stored.add(each)
         found.episodes += is_new
         found.unchanged += not is_new
@@ -279,7 +279,7 @@ class _StoredEpisodes:
             named = ARM_TOPICS[sensor]
             name = rf'(\d{{8}}/\d{{6}}_\d{{3}})_{named}_([0-9a-f]{{{DIGITS}}})_(\d+)\.json'
             pattern = re.compile(rf'{re.escape(arm)}/{named}/{name}', re.ASCII)
-            for info in store.list(schema.BUCKET, f'{arm}/{named}/'):
+            for info in store.list(catalog.BUCKET, f'{arm}/{named}/'):
                 if (match := pattern.fullmatch(info.key)) is None or (begin_ms := _parse_ms(match[1])) is None:
                     continue  # recorded by the arm's own machine
                 self._keys.add(info.key)
@@ -315,17 +315,17 @@ class _StoredEpisodes:
         every = sorted((begin, identity) for identity, begins in self._begins.items() for begin in begins)
         return [f'{iso(begin * MS)} {identity}' for begin, identity in every if begin not in wanted]
 
-    def put(self, each: Demonstration, sensor: str, number: int, values: NDArray[np.float64], found: Imported) -> schema.Row:
+    def put(self, each: Demonstration, sensor: str, number: int, values: NDArray[np.float64], found: Imported) -> catalog.Row:
         """Store the samples from ``number`` times ``PART`` on, if they are missing; returns the row. Raises LakeError,
         StoreError.
         """
         key = self._key(each, sensor, number)
-        held = self._store.head(schema.BUCKET, key) if key in self._keys else None
+        held = self._store.head(catalog.BUCKET, key) if key in self._keys else None
         if held is not None:
             if held.metadata.get(meta.IMPORTED_FROM) != each.identity:
-                raise LakeError(f'{schema.BUCKET}/{key} does not belong to {each.name}', remedy='import it as another --arm')
+                raise LakeError(f'{catalog.BUCKET}/{key} does not belong to {each.name}', remedy='import it as another --arm')
             found.present += 1
-            return schema.row_of(schema.BUCKET, key, held.size, 'application/json', held.metadata)
+            return catalog.row_of(catalog.BUCKET, key, held.size, 'application/json', held.metadata)
         some = slice(number * PART, (number + 1) * PART)
         stamps, values = each.stamps_ns[some], values[some]
         names = list(each.names)
@@ -344,17 +344,17 @@ class _StoredEpisodes:
             path = Path(folder, 'body.json')
             path.write_bytes(body)
             item = SpooledObject(
-                id=0, bucket=schema.BUCKET, key=key, path=path, size=len(body), sha256=sha256, content_type='application/json',
+                id=0, bucket=catalog.BUCKET, key=key, path=path, size=len(body), sha256=sha256, content_type='application/json',
                 metadata=metadata, priority=5, created_ns=time.time_ns(),
             )  # fmt: skip
             try:
                 is_new = self._store.put(item) is Put.CREATED
             except ForeignObject as error:
-                raise LakeError(f'{schema.BUCKET}/{key} exists, and is another recording of that time',
+                raise LakeError(f'{catalog.BUCKET}/{key} exists, and is another recording of that time',
                                 remedy='import it as another --arm, or with other --times') from error  # fmt: skip
         found.objects += is_new
         found.present += not is_new
-        return schema.row_of(schema.BUCKET, key, len(body), 'application/json', metadata)
+        return catalog.row_of(catalog.BUCKET, key, len(body), 'application/json', metadata)
 
     def _key(self, each: Demonstration, sensor: str, number: int) -> str:
         named = ARM_TOPICS[sensor]
@@ -373,9 +373,9 @@ class _StoredEpisodes:
             return self._pieces[place][:2]
         if place:
             begin, identity, key = self._pieces[place - 1]
-            held = self._store.head(schema.BUCKET, key)
+            held = self._store.head(catalog.BUCKET, key)
             if held is not None:
-                row = schema.row_of(schema.BUCKET, key, held.size, 'application/json', held.metadata)
+                row = catalog.row_of(catalog.BUCKET, key, held.size, 'application/json', held.metadata)
                 if (row['t_end_ns'] or 0) >= each.begin_ns:
                     return begin, identity
         return None

@@ -33,7 +33,7 @@ from shadowhound_data_logger.datasets.features import (
 )
 from shadowhound_data_logger.datasets.series import Interval, RecordedSensor, Recordings, read_manifests, select_bags
 from shadowhound_data_logger.datasets.ticks import whole_fps
-from shadowhound_data_logger.formats.rows.schema import Row
+from shadowhound_data_logger.formats.rows.catalog import Row
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

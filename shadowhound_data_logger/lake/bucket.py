@@ -19,8 +19,8 @@ from shadowhound_data_logger.core.errors import ForeignObject
 from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.retry import with_retries
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, SENSOR
 from shadowhound_data_logger.formats.rows.parts import CONTENT_TYPE
-from shadowhound_data_logger.formats.rows.schema import BUCKET, SENSOR
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import warn_of

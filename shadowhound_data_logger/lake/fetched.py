@@ -28,7 +28,7 @@ from typing import Any
 from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.schema import COLUMNS
+from shadowhound_data_logger.formats.rows.catalog import COLUMNS
 from shadowhound_data_logger.lake.row_files import backfilled_key
 
 FOLDER: Final = '.fetch'

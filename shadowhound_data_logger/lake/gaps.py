@@ -23,8 +23,8 @@ from shadowhound_data_logger.core.config import home, store_settings
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, UNDATED
 from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS
-from shadowhound_data_logger.formats.rows.schema import BUCKET, UNDATED
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.tables import answer, literal, quoted

@@ -25,7 +25,7 @@ from deltalake import DeltaTable
 
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import AccessDenied, LakeError
-from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, UNDATED, Row, TableSchema
+from shadowhound_data_logger.formats.rows.catalog import FORGOTTEN, OBJECTS, UNDATED, Row, TableSchema
 from shadowhound_data_logger.lake import summaries
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings

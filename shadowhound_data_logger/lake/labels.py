@@ -25,8 +25,8 @@ from shadowhound_data_logger.core.keys import check_name, is_name
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, check_size, csv_rows, from_json, is_path
 from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, Row
 from shadowhound_data_logger.formats.rows.labels import LABEL, LABELS, MAX_TEXT, REMOVED
-from shadowhound_data_logger.formats.rows.schema import BUCKET, Row
 from shadowhound_data_logger.lake.bucket import Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.select import TimeSpan, Wanted, within

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.untrusted import from_json
-from shadowhound_data_logger.formats.rows.schema import OBJECTS
+from shadowhound_data_logger.formats.rows.catalog import OBJECTS
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.select import Wanted

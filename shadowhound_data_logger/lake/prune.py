@@ -1,4 +1,4 @@
-"""``lake prune``: deletes objects by retention rules, and keeps a row about each (``formats/rows/schema.py``, ``FORGOTTEN``).
+"""``lake prune``: deletes objects by retention rules, and keeps a row about each (``formats/rows/catalog.py``, ``FORGOTTEN``).
 
 It proceeds in this order: a row file with those rows, statements of the gap journal, the commit of the rows to shared tables, the
 deletion of the objects, and a marker next to the row file. A run can be killed at any moment, and two can run at the same time:
@@ -35,8 +35,8 @@ from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES
 from shadowhound_data_logger.formats.rows import gaps as journal
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row, place_of
-from shadowhound_data_logger.formats.rows.schema import OBJECTS as OBJECT_ROWS
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, FORGOTTEN, FORMAT_VERSION, Row, place_of
+from shadowhound_data_logger.formats.rows.catalog import OBJECTS as OBJECT_ROWS
 from shadowhound_data_logger.lake import labels, pull
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings

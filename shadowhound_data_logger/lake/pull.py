@@ -45,7 +45,7 @@ from shadowhound_data_logger.core.model import ON_ROBOT, SpooledObject
 from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.core.untrusted import from_json, visible
-from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS, place_of
+from shadowhound_data_logger.formats.rows.catalog import KEPT, OBJECTS, place_of
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import robots

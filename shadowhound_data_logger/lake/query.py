@@ -26,9 +26,9 @@ from shadowhound_data_logger.core.errors import LakeError, PolicyRefused, StoreE
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.formats.rows.catalog import COLUMNS, FORGOTTEN, OBJECTS
 from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
-from shadowhound_data_logger.formats.rows.schema import COLUMNS, FORGOTTEN, OBJECTS
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.findings import Findings

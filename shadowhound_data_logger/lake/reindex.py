@@ -15,7 +15,7 @@ from typing import Final
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, OBJECTS, Row, TableSchema, is_row, row_of
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, FORGOTTEN, OBJECTS, Row, TableSchema, is_row, row_of
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import backfilled_key

@@ -19,8 +19,8 @@ from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.untrusted import check_size, is_path
+from shadowhound_data_logger.formats.rows.catalog import OBJECTS, SUFFIX, UNDATED, Row, TableSchema
 from shadowhound_data_logger.formats.rows.parts import MAX_FILE_BYTES, read_rows, rows_are
-from shadowhound_data_logger.formats.rows.schema import OBJECTS, SUFFIX, UNDATED, Row, TableSchema
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.tables import DATE, ROBOT, SCHEMAS, TABLES, arrow_schema

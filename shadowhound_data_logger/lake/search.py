@@ -32,7 +32,7 @@ from shadowhound_data_logger.core.errors import ForeignObject, LakeError, Object
 from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MAX_SUMMARY_BYTES, from_json
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings

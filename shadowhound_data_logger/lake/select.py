@@ -16,7 +16,7 @@ from shadowhound_data_logger.core.earth import is_place
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP, CLOCKS
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.formats.rows.schema import UNDATED
+from shadowhound_data_logger.formats.rows.catalog import UNDATED
 
 DAY: Final = timedelta(days=1)
 MAX_BATCH_NS: Final = 3600 * SECOND

@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.untrusted import MAX_MEMBERS
-from shadowhound_data_logger.formats.rows.schema import SENSOR
+from shadowhound_data_logger.formats.rows.catalog import SENSOR
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES

@@ -38,9 +38,9 @@ from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import LakeError, SettingError, SinkUnavailable
 from shadowhound_data_logger.core.retry import backoff, with_retries
 from shadowhound_data_logger.core.untrusted import from_json, visible
+from shadowhound_data_logger.formats.rows.catalog import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.formats.rows.gaps import GAPS, WITHDRAWN
 from shadowhound_data_logger.formats.rows.labels import LABELS, REMOVED
-from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.lake import search
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings

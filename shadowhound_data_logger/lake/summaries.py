@@ -17,7 +17,7 @@ import pyarrow as pa
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, utc
 from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.untrusted import MAX_SUMMARY_BYTES, from_json
-from shadowhound_data_logger.formats.rows.schema import UNDATED
+from shadowhound_data_logger.formats.rows.catalog import UNDATED
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.tables import DATE, MISSION_ROWS, ROBOT, Tables, answer, engine
 

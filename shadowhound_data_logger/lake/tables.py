@@ -27,9 +27,9 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from shadowhound_data_logger.core.config import home
 from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, LakeError
 from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows.catalog import DOUBLE, FORGOTTEN, INT32, INT64, KEPT, OBJECTS, STRING, TIME, TableSchema
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
-from shadowhound_data_logger.formats.rows.schema import DOUBLE, FORGOTTEN, INT32, INT64, KEPT, OBJECTS, STRING, TIME, TableSchema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores.s3_obstore import proxy_options

@@ -33,7 +33,7 @@ from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES
 from shadowhound_data_logger.formats.image import jpeg_statistics
 from shadowhound_data_logger.formats.pointcloud import point_statistics
 from shadowhound_data_logger.formats.records import RECORDS_PER_PART
-from shadowhound_data_logger.formats.rows.schema import OBJECTS as OBJECT_ROWS
+from shadowhound_data_logger.formats.rows.catalog import OBJECTS as OBJECT_ROWS
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.formats.statistics import (
     ALL,

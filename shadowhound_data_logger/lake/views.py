@@ -15,8 +15,8 @@ import pyarrow as pa
 from deltalake import QueryBuilder
 
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
+from shadowhound_data_logger.formats.rows.catalog import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.formats.rows.gaps import GAPS
-from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import fresh, ingest, known_files, pending, unknown_of

@@ -24,7 +24,7 @@ from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.untrusted import visible
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.live.answers import answer, body_of, is_ms, problem
 from shadowhound_data_logger.live.auth import Auth
 from shadowhound_data_logger.spool.files import Tree

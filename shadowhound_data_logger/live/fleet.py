@@ -13,8 +13,8 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.untrusted import visible
+from shadowhound_data_logger.formats.rows.catalog import OBJECTS, UNDATED
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS
-from shadowhound_data_logger.formats.rows.schema import OBJECTS, UNDATED
 from shadowhound_data_logger.lake import gaps as journal
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

@@ -42,7 +42,7 @@ from shadowhound_data_logger.core.untrusted import check_pixels, visible
 from shadowhound_data_logger.formats.mcap.index import McapIndex, read_summary
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.formats.mcap.ranges import Ranged
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.formats.statistics import INFINITE
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.lake import decode

@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.errors import LakeError, SpoolError
 from shadowhound_data_logger.core.mailbox import KeptFilter, Offer, RequestAnswer, offer
 from shadowhound_data_logger.core.model import ON_ROBOT, State
 from shadowhound_data_logger.core.options import UploadSettings
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.spool.control import connect
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.status import read as read_status
@@ -62,7 +62,7 @@ class KeptSource(Protocol):
     """Whether kept objects are included in the recorded runs (``live/past.py``)."""
 
     def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
-        """Objects that are kept or lost, with the part in this time: columns of ``formats.rows.schema.KEPT``."""
+        """Objects that are kept or lost, with the part in this time: columns of ``formats.rows.catalog.KEPT``."""
 
     def mbps(self, robot: str) -> float | None:
         """The robot's upload throughput; None if unknown."""

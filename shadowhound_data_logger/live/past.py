@@ -32,7 +32,7 @@ from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, MAX_OBJECT_BYTES, is_path
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Ranged, StoredFile
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.formats.rows.gaps import GAP
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, gap_rows
 from shadowhound_data_logger.spool.files import Tree
@@ -435,7 +435,7 @@ class StorePast:
         from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415 - the extra lake
         from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
 
-        self._source = Bucket(store_settings(os.environ, home(os.environ)), schema.BUCKET)
+        self._source = Bucket(store_settings(os.environ, home(os.environ)), catalog.BUCKET)
         self._findings = Findings(lambda _: None)
         self._kept: OrderedDict[str, tuple[float, PastDay]] = OrderedDict()
 
@@ -456,8 +456,8 @@ class StorePast:
         """Raises StoreError."""
         from shadowhound_data_logger.lake.views import dates  # noqa: PLC0415
 
-        found = dates(self._source, robot, (schema.OBJECTS, schema.KEPT), self._findings)
-        return [date for date in found if date > schema.UNDATED]
+        found = dates(self._source, robot, (catalog.OBJECTS, catalog.KEPT), self._findings)
+        return [date for date in found if date > catalog.UNDATED]
 
     def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
         """Raises StoreError."""
@@ -517,8 +517,8 @@ class StorePast:
         where, has_date = f"date = '{date}' AND t_start_ns IS NOT NULL", date.__eq__
         if by == BY_RECEIVED:  # the dates of rows are those of stamps
             begin_ns = date_ns(date)
-            where, has_date = f't_start_ns >= {begin_ns} AND t_start_ns < {begin_ns + DAY_NS}', schema.UNDATED.__ne__
-        table = rows_of(self._source, schema.OBJECTS, findings, robot=robot, has_date=has_date, where=where,
+            where, has_date = f't_start_ns >= {begin_ns} AND t_start_ns < {begin_ns + DAY_NS}', catalog.UNDATED.__ne__
+        table = rows_of(self._source, catalog.OBJECTS, findings, robot=robot, has_date=has_date, where=where,
                         columns=_COLUMNS, order='t_start_ns, key', limit=MAX_ROWS, by=by)  # fmt: skip
         left = [f'{one.key}: {one.why}' for one in findings][:3]
         problem = f'{len(findings)} parts of the catalog cannot be read, such as {left[0]}' if left else ''

@@ -21,8 +21,8 @@ from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.model import LOST, ON_ROBOT, DataObject
 from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, KEPT, OBJECTS, SENSOR, Row, TableSchema, row_of
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, name_of, statement
-from shadowhound_data_logger.formats.rows.schema import BUCKET, KEPT, OBJECTS, SENSOR, Row, TableSchema, row_of
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
 from shadowhound_data_logger.formats.statistics import unpack_statistics
 from shadowhound_data_logger.spool import clock_record

@@ -274,7 +274,7 @@ class Schedule:
 
     def _claim(self, now: float) -> SpooledObject | None:
         """An object whose own wait is over goes first; a probe is rather one that has not failed yet."""
-        ours, enough_bytes = [each for each, _ in self._in_flight.values()], self._bytes_in(ENOUGH_S)
+        ours = [each for each, _ in self._in_flight.values()]
 
         def has_room(item: SpooledObject) -> bool:
             """Large objects have half of the threads, so that none of what is live waits for one of them to end.
@@ -283,7 +283,7 @@ class Schedule:
             """
             if item.size >= LARGE_BYTES and sum(each.size >= LARGE_BYTES for each in ours) >= max(self._threads // 2, 1):
                 return False
-            if not ours or len(ours) + 1 < self._threads or sum(each.size for each in ours) <= enough_bytes:
+            if not ours or len(ours) + 1 < self._threads or sum(each.size for each in ours) <= self._bytes_in(ENOUGH_S):
                 return True
             return item.priority < min(each.priority for each in ours)
 

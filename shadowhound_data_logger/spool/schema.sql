@@ -253,10 +253,11 @@ CREATE VIEW messages AS
   FROM objects LEFT JOIN contents ON contents.id = objects.id AND objects.topic IS NULL
   WHERE ifnull(objects.topic, contents.topic) IS NOT NULL AND ifnull(contents.samples, objects.samples) > 0;
 
-CREATE TRIGGER object_lost AFTER INSERT ON objects WHEN NEW.state IN ('evicted', 'quarantined') BEGIN
-  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns,
-      received_start_ns, received_end_ns, samples, 1,
-      (SELECT ifnull(max(version), 0) + 1 FROM gaps) FROM messages WHERE id = NEW.id
+-- Messages inserted here are added to their row of gaps.
+CREATE VIEW lost_messages AS SELECT * FROM messages;
+CREATE TRIGGER messages_lost INSTEAD OF INSERT ON lost_messages BEGIN
+  INSERT INTO gaps VALUES (0, NEW.topic, NEW.state, NEW.reason, 'exact', '', NEW.mission, NEW.begin_ns, NEW.t_start_ns, NEW.t_end_ns,
+      NEW.received_start_ns, NEW.received_end_ns, NEW.samples, 1, (SELECT ifnull(max(version), 0) + 1 FROM gaps))
     ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
       from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
       to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END,
@@ -264,17 +265,12 @@ CREATE TRIGGER object_lost AFTER INSERT ON objects WHEN NEW.state IN ('evicted',
         ELSE excluded.received_from_ns END,
       received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END;
 END;
+CREATE TRIGGER object_lost AFTER INSERT ON objects WHEN NEW.state IN ('evicted', 'quarantined') BEGIN
+  INSERT INTO lost_messages SELECT * FROM messages WHERE id = NEW.id;
+END;
 CREATE TRIGGER contents_lost AFTER INSERT ON contents
     WHEN (SELECT state FROM objects WHERE id = NEW.id) IN ('evicted', 'quarantined') BEGIN
-  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns,
-      received_start_ns, received_end_ns, samples, 1,
-      (SELECT ifnull(max(version), 0) + 1 FROM gaps) FROM messages WHERE id = NEW.id AND topic = NEW.topic
-    ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
-      from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
-      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END,
-      received_from_ns = CASE WHEN count > 0 THEN min(received_from_ns, excluded.received_from_ns)
-        ELSE excluded.received_from_ns END,
-      received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END;
+  INSERT INTO lost_messages SELECT * FROM messages WHERE id = NEW.id AND topic = NEW.topic;
 END;
 -- A lost object may be found, or lost for another reason: subtract its messages from their row, or from the sum that contains it.
 CREATE TRIGGER object_found BEFORE UPDATE OF state, reason ON objects
@@ -290,15 +286,7 @@ CREATE TRIGGER object_found BEFORE UPDATE OF state, reason ON objects
 END;
 CREATE TRIGGER object_lost_later AFTER UPDATE OF state, reason ON objects
     WHEN NEW.state IN ('evicted', 'quarantined') AND (OLD.state <> NEW.state OR OLD.reason IS NOT NEW.reason) BEGIN
-  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns,
-      received_start_ns, received_end_ns, samples, 1,
-      (SELECT ifnull(max(version), 0) + 1 FROM gaps) FROM messages WHERE id = NEW.id
-    ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
-      from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
-      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END,
-      received_from_ns = CASE WHEN count > 0 THEN min(received_from_ns, excluded.received_from_ns)
-        ELSE excluded.received_from_ns END,
-      received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END;
+  INSERT INTO lost_messages SELECT * FROM messages WHERE id = NEW.id;
 END;
 
 PRAGMA user_version = 1;

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.formats.rows.catalog import SENSOR, is_row
 from shadowhound_data_logger.formats.rows.parts import read_rows
-from shadowhound_data_logger.formats.rows.schema import SENSOR, is_row
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.ledger import Ledger

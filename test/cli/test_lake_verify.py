@@ -19,7 +19,7 @@ from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import StoreError, StoreUnavailable
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake import verify
 from shadowhound_data_logger.shipping.audit import DIGEST_BYTES, AuditProgress
 from shadowhound_data_logger.stores import open_store
@@ -39,7 +39,7 @@ def home(tmp_path: Path) -> Path:
                 add(store, tmp_path / 'tmp', row(sensor, stamp_ns)['key'], content(sensor, stamp_ns))
             add_part(store, [row(sensor, stamp_ns) for stamp_ns in TIMES], sensor, tmp_path / 'tmp')
         add(store, tmp_path / 'tmp', PATH, b'x,y', bucket='trajectories')
-        path = schema.row_of('trajectories', PATH, 3, 'text/csv', {'t_start_ns': str(NOON_NS)})
+        path = catalog.row_of('trajectories', PATH, 3, 'text/csv', {'t_start_ns': str(NOON_NS)})
         add_part(store, [path], 'path', tmp_path / 'tmp')
     return tmp_path
 
@@ -61,7 +61,7 @@ def found(said: dict[str, Any]) -> dict[str, list[str]]:
 
 
 def file(home: Path, key: str) -> Path:
-    return home / 'store' / schema.BUCKET / key
+    return home / 'store' / catalog.BUCKET / key
 
 
 @pytest.mark.parametrize('deep', [[], ['--deep']])
@@ -81,7 +81,7 @@ def test_each_loss_is_named(home: Path) -> None:
     file(home, gone).unlink()
     file(home, cut).write_bytes(b'cut')
     file(home, changed).write_bytes(file(home, changed).read_bytes()[::-1])
-    (home / 'store' / '.metadata' / schema.BUCKET / f'{foreign}.json').unlink()
+    (home / 'store' / '.metadata' / catalog.BUCKET / f'{foreign}.json').unlink()
     assert found(as_json(home)) == {'missing': [gone], 'size': [cut], 'foreign': [foreign]}
     assert found(as_json(home, '--deep')) == {'missing': [gone], 'size': [cut], 'checksum': [changed]}
     text = run(home)

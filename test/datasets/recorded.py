@@ -22,8 +22,8 @@ from lake.training import COMPRESSED, IMU, JOINTS, ODOMETRY, Drive
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.model import DataObject
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.formats.rows.gaps import GAP, Statement, complete, statement
-from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores import open_store
 

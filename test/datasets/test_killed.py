@@ -25,7 +25,7 @@ pytestmark = pytest.mark.long('an export for each file that it writes')
 DYING = """
 import os, signal, sys
 from pathlib import Path
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.lake.bucket import Bucket

@@ -18,7 +18,7 @@ from shadowhound_tower.embedded import Tower
 from shadowhound_data_logger import MissionDataLogger, lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.tables import arrow_schema
@@ -42,7 +42,7 @@ def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
     found = {}
     for bucket in ('sensor-data', 'trajectories'):
         for info in store.list(bucket, f'{robot}/'):
-            if schema.is_row(bucket, info.key) and (told := store.head(bucket, info.key)) is not None:
+            if catalog.is_row(bucket, info.key) and (told := store.head(bucket, info.key)) is not None:
                 found[bucket, info.key] = told
     return found
 
@@ -50,10 +50,10 @@ def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
 def cataloged(store: S3Store, robot: str) -> list[dict[str, Any]]:
     """All rows of all parts; each has the schema and the date of its folder."""
     rows = []
-    for info in store.list(schema.BUCKET, schema.OBJECTS.prefix(robot)):
-        found = read_rows(store.get(schema.BUCKET, info.key), robot)
+    for info in store.list(catalog.BUCKET, catalog.OBJECTS.prefix(robot)):
+        found = read_rows(store.get(catalog.BUCKET, info.key), robot)
         assert not found.findings
-        for row in pa.Table.from_pylist(found.rows[schema.SENSOR], schema=arrow_schema()).to_pylist():
+        for row in pa.Table.from_pylist(found.rows[catalog.SENSOR], schema=arrow_schema()).to_pylist():
             assert f'/date={row["t_start"]:%Y-%m-%d}/' in info.key
             rows.append(row)
     return rows
@@ -81,9 +81,9 @@ def check(rows: list[dict[str, Any]], objects: dict[tuple[str, str], ObjectInfo]
     assert Counter((row['bucket'], row['key']) for row in rows) == Counter(objects.keys())
     for row in rows:
         info = objects[row['bucket'], row['key']]
-        again = schema.row_of(info.bucket, info.key, info.size, info.content_type, info.metadata)
-        assert [row[name] for name in schema.COLUMNS if name not in TOLD_OTHERWISE] == [
-            again[name] for name in schema.COLUMNS if name not in TOLD_OTHERWISE
+        again = catalog.row_of(info.bucket, info.key, info.size, info.content_type, info.metadata)
+        assert [row[name] for name in catalog.COLUMNS if name not in TOLD_OTHERWISE] == [
+            again[name] for name in catalog.COLUMNS if name not in TOLD_OTHERWISE
         ]
     for sensor in WITH_HEADER:
         found = [row['x'] is not None for row in rows if row['sensor'] == sensor]
@@ -103,7 +103,7 @@ def check(rows: list[dict[str, Any]], objects: dict[tuple[str, str], ObjectInfo]
 def test_every_object_has_one_row_and_the_right_pose(session: Session, store: S3Store) -> None:
     """Those of the sensors and the slices of the bag, in several parts."""
     check(cataloged(store, session.robot), listed(store, session.robot), store)
-    assert len(list(store.list(schema.BUCKET, schema.OBJECTS.prefix(session.robot)))) > 1
+    assert len(list(store.list(catalog.BUCKET, catalog.OBJECTS.prefix(session.robot)))) > 1
 
 
 def judge_gaps(source: Bucket, robot: str, ledger: dict[str, Any]) -> None:
@@ -127,7 +127,7 @@ def spans(source: Bucket, robot: str, topic: str) -> list[tuple[int, int]]:
 @pytest.mark.timeout(300 + 2 * DURATION_S)
 def test_gaps_and_watermarks_reach_the_store(session: Session, seaweed: Tower) -> None:
     """The journal in the store adds up to the ledger; a node that ended by itself leaves nothing open of what it heard."""
-    source = Bucket(seaweed.store_settings(), schema.BUCKET)
+    source = Bucket(seaweed.store_settings(), catalog.BUCKET)
     judge_gaps(source, session.robot, session.ledger)
     for topic in ('/imu', '/odom', '/joint_states'):
         ((first_ns, last_ns),) = spans(source, session.robot, topic)
@@ -149,7 +149,7 @@ def test_a_killed_node_reports_all_gaps(processes: Processes, seaweed: Tower, st
         until(lambda: node.topic('/odom').get('stored', 0) >= 2, 'the robot walks')
         logger.start_mission('patrol', 'go round')
         until(
-            lambda: any(store.list(schema.BUCKET, schema.OBJECTS.prefix(processes.robot))),
+            lambda: any(store.list(catalog.BUCKET, catalog.OBJECTS.prefix(processes.robot))),
             'a part is there while the robot walks',
         )
         node.kill()
@@ -163,7 +163,7 @@ def test_a_killed_node_reports_all_gaps(processes: Processes, seaweed: Tower, st
         logger.close()
     ledger = node.stop()
     assert ledger['objects']['pending'] == 0
-    source = Bucket(seaweed.store_settings(), schema.BUCKET)
+    source = Bucket(seaweed.store_settings(), catalog.BUCKET)
     judge_gaps(source, processes.robot, ledger)
     (_, died_ns), (again_ns, _) = spans(source, processes.robot, '/odom')
     known = lake.known(processes.robot, '/odom', died_ns, again_ns, source=source)

@@ -15,8 +15,8 @@ from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.rows.catalog import row_of
 from shadowhound_data_logger.formats.rows.parts import encode
-from shadowhound_data_logger.formats.rows.schema import row_of
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / 'docs' / 'formats.md').read_text(encoding='utf-8')

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch, Sample
 from shadowhound_data_logger.formats.encoders import encode
-from shadowhound_data_logger.formats.rows.schema import row_of
+from shadowhound_data_logger.formats.rows.catalog import row_of
 from shadowhound_data_logger.formats.statistics import ALL, FieldStatistics
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.lake import decode

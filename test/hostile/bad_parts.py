@@ -9,16 +9,16 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.zstd import compress
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 
 DATE: Final = '2026-10-28'
 
 
 def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor',
-        of: schema.TableSchema = schema.OBJECTS) -> str:  # fmt: skip
+        of: catalog.TableSchema = catalog.OBJECTS) -> str:  # fmt: skip
     """As a robot that may write below its own prefix puts it; its key."""
     key = of.part_key(robot, DATE, name)
-    path = settings.directory / schema.BUCKET / key
+    path = settings.directory / catalog.BUCKET / key
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(body)
     return key

@@ -45,7 +45,7 @@ from shadowhound_data_logger.core.untrusted import csv_cell, visible
 from shadowhound_data_logger.formats.mcap.format import CHUNK, RECORD, record, text
 from shadowhound_data_logger.formats.mcap.index import records
 from shadowhound_data_logger.formats.mcap.messages import unpack
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
@@ -262,10 +262,10 @@ def row_files_(shop: Shop) -> Round:
     return one
 
 
-def _row(given: schema.Row, rng: random.Random) -> schema.Row:
+def _row(given: catalog.Row, rng: random.Random) -> catalog.Row:
     made = dict(given)
-    for name in rng.sample(list(schema.COLUMNS), 3):
-        kind = schema.COLUMNS[name]
+    for name in rng.sample(list(catalog.COLUMNS), 3):
+        kind = catalog.COLUMNS[name]
         made[name] = (
             rng.choice(TEXTS).replace('\ud800', '?') if kind == 'string' else rng.choice((0, -1, 5, (1 << 63) - 1, -(1 << 63)))
         )
@@ -283,10 +283,10 @@ def summaries(shop: Shop) -> Round:
 
     def one(rng: random.Random) -> str:
         shop.clear()
-        root = shop.input / schema.BUCKET / 'thor' / 'missions' / 'run'
+        root = shop.input / catalog.BUCKET / 'thor' / 'missions' / 'run'
         root.mkdir(parents=True)
         (root / 'summary.json').write_bytes(as_json(fine, rng))
-        source = Bucket(StoreSettings(directory=shop.input), schema.BUCKET)
+        source = Bucket(StoreSettings(directory=shop.input), catalog.BUCKET)
         run = rng.choice(('run', 'run', 'run', *TEXTS))
         with shop.reading():
             found = uploaded(source, [(rng.choice(('thor', 'thor', *TEXTS)), run)])
@@ -303,16 +303,16 @@ def fetched_objects(shop: Shop) -> Round:
     def one(rng: random.Random) -> str:
         shop.clear()
         for key, body in bodies.items():
-            path = shop.input / schema.BUCKET / key
+            path = shop.input / catalog.BUCKET / key
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(body)
         settings = StoreSettings(directory=shop.input)
         requests = [
-            FetchRequest(rng.choice((schema.BUCKET, schema.BUCKET, schema.BUCKET, '..', '.')),
+            FetchRequest(rng.choice((catalog.BUCKET, catalog.BUCKET, catalog.BUCKET, '..', '.')),
                  rng.choice((*bodies, *TEXTS, '../' * 5 + 'x')),
                  rng.choice((7, 3000, *NUMBERS)), rng.choice((None, 'ab', 64 * '0')))
             for _ in range(4)
-        ] + [FetchRequest(schema.BUCKET, key, len(body)) for key, body in bodies.items() if rng.random() < 0.5]  # fmt: skip
+        ] + [FetchRequest(catalog.BUCKET, key, len(body)) for key, body in bodies.items() if rng.random() < 0.5]  # fmt: skip
         with shop.reading():
             found = fetch_objects(requests, shop.target, DirectoryStore(settings.directory), threads=2)
         return f'{found.moved} moved'

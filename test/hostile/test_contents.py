@@ -23,7 +23,7 @@ from PIL import Image
 
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES, MAX_PIXELS, decompress, from_json, from_yaml
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
@@ -227,10 +227,10 @@ def test_at_most_the_size_in_the_row_is_read() -> None:
 def test_an_invalid_summary_affects_only_its_mission(tmp_path: Path, told: bytes) -> None:
     """However deep or large it is."""
     settings = folder_store(tmp_path)
-    path = settings.directory / schema.BUCKET / 'thor/missions/run/summary.json'
+    path = settings.directory / catalog.BUCKET / 'thor/missions/run/summary.json'
     path.parent.mkdir(parents=True)
     path.write_bytes(told)
-    assert len(uploaded(Bucket(settings, schema.BUCKET), [('thor', 'run')])) == 0
+    assert len(uploaded(Bucket(settings, catalog.BUCKET), [('thor', 'run')])) == 0
 
 
 def test_a_row_that_claims_a_million_messages_is_skipped(tmp_path: Path) -> None:
@@ -246,7 +246,7 @@ def test_a_row_that_claims_a_million_messages_is_skipped(tmp_path: Path) -> None
         {**row('camera', NOON_NS + 2 * 10**9), 'count': -1},
     ]
     bad_parts.put(folder_store(tmp_path), parts.encode(rows))
-    frames = lake.MissionDataset(Bucket(folder_store(tmp_path), schema.BUCKET))
+    frames = lake.MissionDataset(Bucket(folder_store(tmp_path), catalog.BUCKET))
     assert len(frames) == 1
     assert len(frames.skipped) == 2
     assert np.array_equal(frames.stamps_ns, [NOON_NS])

@@ -20,7 +20,7 @@ from shadowhound_data_logger import lake
 from shadowhound_data_logger.cli.lake import lake as lake_command
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -38,7 +38,7 @@ def with_(**fields: Any) -> bytes:
 BAD: dict[str, Callable[[], bytes]] = {
     'empty': lambda: b'',
     'garbage': lambda: random.Random(1).randbytes(5000),
-    'a part of the catalogue': lambda: parts.encode([schema.row_of('sensor-data', 'thor/a', 1, '', {})]),
+    'a part of the catalogue': lambda: parts.encode([catalog.row_of('sensor-data', 'thor/a', 1, '', {})]),
     'a text for a number': lambda: bad_parts.lines(ROWS, 'gap', revision='newest'),
     'a number for an id': lambda: bad_parts.lines(ROWS, 'gap', id=1),
     'no revision': lambda: bad_parts.lines(ROWS, 'gap', revision=None),
@@ -67,7 +67,7 @@ def run(command: Callable[..., object], home: Path, *arguments: str) -> Result:
 @pytest.mark.parametrize('kind', BAD)
 def test_a_bad_part_affects_no_other_robot(home: Path, kind: str) -> None:
     """``query``, ``lake coverage`` and ``known`` answer with the rest, name the part, and say that there is one."""
-    source = Bucket(folder_store(home), schema.BUCKET)
+    source = Bucket(folder_store(home), catalog.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source)
     assert [gap.count for gap in before.gaps] == [5]
     key = bad_parts.put(folder_store(home), BAD[kind](), of=GAPS)
@@ -86,7 +86,7 @@ def test_ingest_leaves_it_alone(home: Path) -> None:
     """The others are merged; it stays as it is."""
     tell(folder_store(home), home, lost('2', 700, 701), name='b')
     key = bad_parts.put(folder_store(home), BAD['a text for a number'](), of=GAPS)
-    source = Bucket(folder_store(home), schema.BUCKET)
+    source = Bucket(folder_store(home), catalog.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source, findings=Findings(lambda _: None))
     found = run(lake_command, home, 'ingest', '--delete-after', '0s')
     assert (found.return_value, f'{key} is skipped: ' in found.stderr) == (1, True)
@@ -96,7 +96,7 @@ def test_ingest_leaves_it_alone(home: Path) -> None:
 
 def test_no_robot_speaks_for_another(home: Path) -> None:
     """Statements of tachi with the names of thor's change nothing that thor told."""
-    source = Bucket(folder_store(home), schema.BUCKET)
+    source = Bucket(folder_store(home), catalog.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source)
     theirs = [
         {**lost('1', 600, 660, 99, 'withdrawn'), 'robot': 'tachi'},
@@ -145,7 +145,7 @@ def test_extremes_that_are_sane_are_answered(tmp_path: Path) -> None:
         {**lost('9', 5, 6), 'from_ns': -MOST, 'to_ns': NOON_NS + 1, 'count': MOST},
     ]
     bad_parts.put(folder_store(tmp_path), parts.encode(rows, GAPS), of=GAPS)
-    source = Bucket(folder_store(tmp_path), schema.BUCKET)
+    source = Bucket(folder_store(tmp_path), catalog.BUCKET)
     (found,) = coverage(NOON_NS, END_NS, source=source)
     assert [(each.causes, each.grade) for each in found.known.stretches] == [(('transport',), 'exact'), ((), 'exact')]
     assert len(lake.sql('SELECT * FROM gaps', source).to_pylist()) == 1

@@ -25,7 +25,7 @@ from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake as lake_command
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.core.config import UploadSettings
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -80,7 +80,7 @@ def home(sound: Path, tmp_path: Path) -> Path:
 
 def good(home: Path) -> list[str]:
     """The keys of all rows that count."""
-    return sorted(lake.objects(Bucket(folder_store(home), schema.BUCKET))['key'].to_pylist())
+    return sorted(lake.objects(Bucket(folder_store(home), catalog.BUCKET))['key'].to_pylist())
 
 
 def run(command: Callable[..., object], home: Path, *arguments: str) -> Result:
@@ -135,7 +135,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
     before = good(home)
     key = bad_parts.put(folder_store(home), parts.encode([*mine, *THEIRS]))
     findings = Findings(lambda _: None)
-    source = Bucket(folder_store(home), schema.BUCKET)
+    source = Bucket(folder_store(home), catalog.BUCKET)
     found = lake.objects(source, findings=findings)['key'].to_pylist()
     assert sorted(found) == sorted([*before, *(str(each['key']) for each in mine)])
     assert [(one.key, one.rows) for one in findings] == [(key, 3)]
@@ -144,7 +144,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
 
 def test_a_dataset_reports_what_it_skips(home: Path) -> None:
     """And has all the rest."""
-    source = Bucket(folder_store(home), schema.BUCKET)
+    source = Bucket(folder_store(home), catalog.BUCKET)
     count = len(lake.MissionDataset(source))
     key = bad_parts.put(folder_store(home), b'')
     frames = lake.MissionDataset(source)
@@ -156,7 +156,7 @@ def test_a_dataset_reports_what_it_skips(home: Path) -> None:
 def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None:
     """Folders that are not dates, and names that are not robots, are not part of the catalogue."""
     before = good(home)
-    root = home / 'store' / schema.BUCKET
+    root = home / 'store' / catalog.BUCKET
     for folder in (
         'thor/_catalog/date=\x1b[31m',
         'thor/_catalog/date=..',
@@ -164,11 +164,11 @@ def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None
         '-x/_catalog/date=2026-10-28',
     ):
         (root / folder).mkdir(parents=True)
-        (root / folder / f'x{schema.SUFFIX}').write_bytes(parts.encode(ROWS))
+        (root / folder / f'x{catalog.SUFFIX}').write_bytes(parts.encode(ROWS))
     assert good(home) == before
     (root / 'thor/_catalog/date=2026-10-28/\x1b[31m.jsonl.zst').write_bytes(parts.encode(ROWS))
     findings = Findings(lambda _: None)
-    lake.objects(Bucket(folder_store(home), schema.BUCKET), findings=findings)
+    lake.objects(Bucket(folder_store(home), catalog.BUCKET), findings=findings)
     named = {(one.key.rpartition('/')[2], '\x1b' in str(one)) for one in findings}
     assert named == {('\x1b[31m.jsonl.zst', False), ('x.jsonl.zst', False)}
 

@@ -21,7 +21,7 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import BagDamaged, LakeError, NameRefused, ObjectRefused, StoreError
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.untrusted import path_below
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.stores import open_store
@@ -47,12 +47,12 @@ def test_what_is_one_is_below(tmp_path: Path, key: str) -> None:
 def test_a_data_set_reads_nothing_outside(tmp_path: Path, key: str, is_fetched: bool) -> None:
     """A row whose key leads to a file of this machine: of a store in a folder, and of a folder of fetched objects."""
     (tmp_path / 'secret.jpg').write_bytes(b'secret')
-    root = tmp_path / 'store' / schema.BUCKET
+    root = tmp_path / 'store' / catalog.BUCKET
     (root / 'thor').mkdir(parents=True)
     (root / 'secret.jpg').write_bytes(b'secret')
     told = {**row('camera', NOON_NS), 'key': key, 'sha256': None, 'bytes': 6}
     bad_parts.put(folder_store(tmp_path), parts.encode([told]))
-    frames = lake.MissionDataset(root if is_fetched else Bucket(folder_store(tmp_path), schema.BUCKET))
+    frames = lake.MissionDataset(root if is_fetched else Bucket(folder_store(tmp_path), catalog.BUCKET))
     assert len(frames) == 1
     with pytest.raises((StoreError, LakeError), match='not a path'):
         frames[0]
@@ -81,8 +81,8 @@ def test_a_source_reads_nothing_outside_its_bucket(tmp_path: Path) -> None:
     run_id = '../../../../secret'
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [{**row('camera', NOON_NS), 'mission_id': 'm', 'run_id': run_id}], 'a', tmp_path / 'tmp')
-    (settings.directory / schema.BUCKET / 'thor' / 'missions').mkdir()
-    source = Bucket(settings, schema.BUCKET)
+    (settings.directory / catalog.BUCKET / 'thor' / 'missions').mkdir()
+    source = Bucket(settings, catalog.BUCKET)
     assert lake.missions(source).to_pydict()['result'] == [None]
     key = f'thor/missions/{run_id}/summary.json'
     for ask in (lambda: source.get(key, 100), lambda: source.head(key),

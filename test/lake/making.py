@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import ingest, maintain
@@ -35,7 +35,7 @@ SENSORS: Final = {
 }
 
 
-def row(sensor: str, stamp_ns: int, robot: str = 'thor', **more: str) -> schema.Row:
+def row(sensor: str, stamp_ns: int, robot: str = 'thor', **more: str) -> catalog.Row:
     """The row of one object as a robot writes it; place and battery follow from the time."""
     topic, kind, extension, content_type = SENSORS[sensor]
     turn = stamp_ns % DAY_NS / DAY_NS * 48 * math.pi
@@ -49,7 +49,7 @@ def row(sensor: str, stamp_ns: int, robot: str = 'thor', **more: str) -> schema.
         **({'mission_id': mission, 'run_id': f'run-{mission}', 'mission_type': 'patrol'} if mission else {}), **more,
     }  # fmt: skip
     key = f'{robot}/{sensor}/{utc(stamp_ns):%Y%m%d/%H%M%S}_x.{extension}'
-    return schema.row_of(schema.BUCKET, key, len(content(sensor, stamp_ns)), content_type, metadata)
+    return catalog.row_of(catalog.BUCKET, key, len(content(sensor, stamp_ns)), content_type, metadata)
 
 
 def content(sensor: str, stamp_ns: int) -> bytes:
@@ -57,7 +57,7 @@ def content(sensor: str, stamp_ns: int) -> bytes:
     return f'{sensor} {stamp_ns} '.encode() * 20
 
 
-Minute = tuple[int, list[schema.Row]]
+Minute = tuple[int, list[catalog.Row]]
 
 
 def minutes(days: Sequence[int] = (0, 1), hours: Sequence[int] = (11, 12), robot: str = 'thor') -> Iterator[Minute]:
@@ -70,16 +70,16 @@ def minutes(days: Sequence[int] = (0, 1), hours: Sequence[int] = (11, 12), robot
                 yield begin_ns, rows
 
 
-def add_part(store: ObjectStore, rows: Sequence[schema.Row], name: str, folder: Path) -> str:
+def add_part(store: ObjectStore, rows: Sequence[catalog.Row], name: str, folder: Path) -> str:
     """A row file, as the robot delivers it."""
     robot = str(rows[0]['robot'])
-    key = schema.OBJECTS.part_key(robot, schema.date_of(rows[0]), name)
+    key = catalog.OBJECTS.part_key(robot, catalog.date_of(rows[0]), name)
     add(store, folder, key, parts.encode(rows), {'robot': robot})
     return key
 
 
 def add(store: ObjectStore, folder: Path, key: str, body: bytes, metadata: dict[str, str] | None = None,
-        bucket: str = schema.BUCKET, content_type: str = 'application/octet-stream') -> None:  # fmt: skip
+        bucket: str = catalog.BUCKET, content_type: str = 'application/octet-stream') -> None:  # fmt: skip
     """An object in the store."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / 'body'
@@ -89,9 +89,9 @@ def add(store: ObjectStore, folder: Path, key: str, body: bytes, metadata: dict[
                             metadata=metadata or {}, priority=5, created_ns=0))  # fmt: skip
 
 
-def fill(settings: StoreSettings, folder: Path, **which: Any) -> list[schema.Row]:
+def fill(settings: StoreSettings, folder: Path, **which: Any) -> list[catalog.Row]:
     """Deliver the row files of some minutes, and the missions' summaries; returns the rows of the catalog."""
-    every: list[schema.Row] = []
+    every: list[catalog.Row] = []
     with closing(open_store(settings, UploadSettings())) as store:
         for begin_ns, rows in minutes(**which):
             add_part(store, rows, f'{utc(begin_ns):%Y%m%dT%H%M%S}_boot', folder)
@@ -148,17 +148,17 @@ class Watched:
         self.inner.delete(key)
 
 
-def watched(settings: StoreSettings, bucket: str = schema.BUCKET) -> Watched:
+def watched(settings: StoreSettings, bucket: str = catalog.BUCKET) -> Watched:
     return Watched(Bucket(settings, bucket))
 
 
-def keys(rows: Sequence[schema.Row]) -> list[str]:
+def keys(rows: Sequence[catalog.Row]) -> list[str]:
     return sorted(row['key'] for row in rows)
 
 
 def merge(settings: StoreSettings) -> int:
     """Ingest all row files, and make one file of each day; how many files of tables became larger ones."""
-    source = Bucket(settings, schema.BUCKET)
+    source = Bucket(settings, catalog.BUCKET)
     tables = Tables.for_ingest(source)
     ingest(source, tables, Findings(lambda _: None))
     return maintain(source, tables, Findings(lambda _: None)).merged

@@ -15,7 +15,7 @@ from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, jpeg, 
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, SettingError, UnknownName
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, Near, Window, query, selecting
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import FetchRequest, fetch

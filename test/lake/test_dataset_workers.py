@@ -19,7 +19,7 @@ from lake.making import folder_store
 from lake.training import FRAMES_HZ, Drive, in_a_child
 
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, dataset, prefetch, shards
 from shadowhound_data_logger.lake.bucket import Bucket
 

@@ -18,7 +18,7 @@ from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import ingest

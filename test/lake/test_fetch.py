@@ -16,7 +16,7 @@ from shadowhound_data_logger.core import retry
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, StoreUnavailable
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import FetchRequest, FetchResult, fetch, under
 from shadowhound_data_logger.lake.fetched import Fetched, keep_rows

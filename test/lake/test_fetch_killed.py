@@ -22,7 +22,7 @@ from lake.making import NOON_NS, add, add_part
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake.fetched import Fetched, keep_rows
 from shadowhound_data_logger.stores import open_store
 
@@ -53,7 +53,7 @@ class Counting(Front):
         self.got: list[str] = []
 
     def forward(self, request: Request, *, slowly: bool = False) -> bytes:
-        key = request.target.partition('?')[0].removeprefix(f'/{schema.BUCKET}/')
+        key = request.target.partition('?')[0].removeprefix(f'/{catalog.BUCKET}/')
         if request.method == 'GET' and key in SUMS:
             self.got.append(key)
         return super().forward(request, slowly=slowly)
@@ -70,7 +70,7 @@ def filled(seaweed: Tower, tmp_path_factory: pytest.TempPathFactory) -> Tower:
             told = {'robot': ROBOT, 'sensor': 'camera', 't_start_ns': stamp, 't_end_ns': stamp}
             add(store, folder, key, body(number), told)
             said = {**told, 'sha256': SUMS[key]}
-            rows.append(schema.row_of(schema.BUCKET, key, len(body(number)), 'image/jpeg', said))
+            rows.append(catalog.row_of(catalog.BUCKET, key, len(body(number)), 'image/jpeg', said))
         add_part(store, rows, 'part', folder)
     return seaweed
 
@@ -96,7 +96,7 @@ def left_over(to: Path) -> list[str]:
 
 def test_rows_that_were_being_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed at that moment they are not there, and what there was of them goes with the next fetch."""
-    said = schema.row_of('sensor-data', f'{ROBOT}/camera/x.jpg', 1, 'image/jpeg', {'t_start_ns': str(NOON_NS)})
+    said = catalog.row_of('sensor-data', f'{ROBOT}/camera/x.jpg', 1, 'image/jpeg', {'t_start_ns': str(NOON_NS)})
 
     def die(_: object, __: object) -> None:
         raise SystemExit

@@ -17,8 +17,8 @@ from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.formats.rows.gaps import GAP, WITHDRAWN, Statement, statement
-from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import gaps
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.gaps import MAX_CAUSES, Stretch, coverage, known, of_rows

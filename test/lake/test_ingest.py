@@ -19,7 +19,7 @@ from shadowhound_data_logger import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.zstd import ZstdDecompressor, compress
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake import ingest as library
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -41,7 +41,7 @@ def tables(tmp_path: Path) -> Tables:
 
 
 def bucket(tmp_path: Path) -> Bucket:
-    return Bucket(folder_store(tmp_path), schema.BUCKET)
+    return Bucket(folder_store(tmp_path), catalog.BUCKET)
 
 
 def table_keys(tables: Tables) -> list[str]:
@@ -62,9 +62,9 @@ def test_every_row_is_in_the_table_once(tmp_path: Path, tables: Tables) -> None:
     by_key = {each['key']: each for each in rows}
     for each in found:
         wrote = by_key[each['key']]
-        assert each['date'] == schema.date_of(wrote)
-        assert {name: each[name] for name in schema.COLUMNS if not name.startswith('t_')} == {
-            name: wrote[name] for name in schema.COLUMNS if not name.startswith('t_')
+        assert each['date'] == catalog.date_of(wrote)
+        assert {name: each[name] for name in catalog.COLUMNS if not name.startswith('t_')} == {
+            name: wrote[name] for name in catalog.COLUMNS if not name.startswith('t_')
         }
         assert each['t_start'].timestamp() * 1e6 == wrote['t_start']
         assert each['t_start_ns'] == wrote['t_start_ns']
@@ -178,9 +178,9 @@ def test_row_files_are_read_in_addition_to_the_tables(tmp_path: Path, tables: Ta
         ingested, opened = tables.open(INGESTED), tables.open(OBJECT_ROWS)
         add_part(store, new + old, 'b', tmp_path / 'tmp')
     files = pending(ingested, row_files(source, Findings(), Scope()))
-    assert keys(fresh(source, files, opened, schema.OBJECTS, Findings()).to_pylist()) == keys(new)
+    assert keys(fresh(source, files, opened, catalog.OBJECTS, Findings()).to_pylist()) == keys(new)
     ingest(source, tables, Findings())
-    assert len(fresh(source, files, tables.open(OBJECT_ROWS), schema.OBJECTS, Findings())) == 0
+    assert len(fresh(source, files, tables.open(OBJECT_ROWS), catalog.OBJECTS, Findings())) == 0
 
 
 def test_a_file_that_is_not_one_is_named_and_counted(tmp_path: Path, tables: Tables) -> None:
@@ -189,7 +189,7 @@ def test_a_file_that_is_not_one_is_named_and_counted(tmp_path: Path, tables: Tab
     rows = [row('camera', NOON_NS)]
     with closing(open_store(source.settings, UploadSettings())) as store:
         add_part(store, rows, 'a', tmp_path / 'tmp')
-        bad = schema.OBJECTS.part_key('thor', '2026-10-28', 'bad')
+        bad = catalog.OBJECTS.part_key('thor', '2026-10-28', 'bad')
         add(store, tmp_path / 'tmp', bad, b'hello')
     done = ingest(source, tables, findings)
     assert (done.rows, done.rejected) == (1, 1)
@@ -208,7 +208,7 @@ def test_the_rows_of_a_newer_robot_are_added_without_the_columns_that_are_unknow
     lines = ZstdDecompressor().decompress(parts.encode(rows)).splitlines(keepends=True)
     lines[1] = lines[1].replace(b'{', b'{"lens":{"f":[1.5]},"date":"../x",', 1)
     with closing(open_store(source.settings, UploadSettings())) as store:
-        add(store, tmp_path / 'tmp', schema.OBJECTS.part_key('thor', '2026-10-28', 'newer'), compress(b''.join(lines)))
+        add(store, tmp_path / 'tmp', catalog.OBJECTS.part_key('thor', '2026-10-28', 'newer'), compress(b''.join(lines)))
         add_part(store, [row('odom', NOON_NS)], 'a', tmp_path / 'tmp')
     done = ingest(source, tables, findings)
     assert (done.rows, done.rejected, done.unknown, len(findings)) == (4, 0, 1, 0)
@@ -235,7 +235,7 @@ for _ in range(10):
 def test_two_ingesters_and_a_compaction_at_a_time_add_every_row_once(tmp_path: Path, tables: Tables) -> None:
     """Processes that start from the same versions again and again."""
     source = bucket(tmp_path)
-    rows: list[schema.Row] = []
+    rows: list[catalog.Row] = []
     with closing(open_store(source.settings, UploadSettings())) as store:
         for number in range(20):
             made = [row('camera', NOON_NS + (number * 10 + second) * SECOND) for second in range(5)]
@@ -282,19 +282,19 @@ def test_on_a_server_row_files_expire_after_their_commit(tower: Tower, tmp_path:
     settings = tower.store_settings()
     client = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
                           aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
-    for name in ('lake', schema.BUCKET):
+    for name in ('lake', catalog.BUCKET):
         if name not in {each['Name'] for each in client.list_buckets()['Buckets']}:
             client.create_bucket(Bucket=name)
     client.close()
-    source, robot = Bucket(settings, schema.BUCKET), f'r{tmp_path.name.replace("_", "-")}'[:40].rstrip('-')
+    source, robot = Bucket(settings, catalog.BUCKET), f'r{tmp_path.name.replace("_", "-")}'[:40].rstrip('-')
     tables = Tables(f's3://lake/{robot}', settings)
     tables.create()
     rows = [row('camera', NOON_NS + second * SECOND, robot) for second in range(3)]
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, rows, 'a', tmp_path / 'tmp')
-        bad = schema.OBJECTS.part_key(robot, '2026-10-28', 'bad')
+        bad = catalog.OBJECTS.part_key(robot, '2026-10-28', 'bad')
         add(store, tmp_path / 'tmp', bad, b'hello')
-        newer = schema.OBJECTS.part_key(robot, '2026-10-28', 'newer')
+        newer = catalog.OBJECTS.part_key(robot, '2026-10-28', 'newer')
         add(store, tmp_path / 'tmp', newer, parts.encode([{**rows[0], 'color': 'red'}]))
     only = Scope(robot=robot)
     assert ingest(source, tables, Findings(lambda _: None), row_files(source, Findings(), only)).rows == 3

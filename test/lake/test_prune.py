@@ -19,7 +19,7 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import AccessDenied, LakeError, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.formats.rows.gaps import complete
 from shadowhound_data_logger.formats.rows.parts import encode
 from shadowhound_data_logger.lake import gaps, labels, prune, pull, verify
@@ -62,7 +62,7 @@ class MortalStore:
 
 
 def _source(settings: StoreSettings) -> Bucket:
-    return Bucket(settings, schema.BUCKET)
+    return Bucket(settings, catalog.BUCKET)
 
 
 def _fill(settings: StoreSettings, folder: Path) -> None:
@@ -88,7 +88,7 @@ def _add_bag(settings: StoreSettings, folder: Path, name: str, begin_ns: int, *,
         for number, (key, (body, at_ns)) in enumerate(bodies.items()):
             said = {'robot': 'thor', 'sensor': 'bag', 't_start_ns': str(at_ns), 't_end_ns': str(at_ns + SECOND)}
             add(store, folder, key, body, said)
-            add_part(store, [schema.row_of(schema.BUCKET, key, len(body), '', said)], f'{name}{number}', folder)
+            add_part(store, [catalog.row_of(catalog.BUCKET, key, len(body), '', said)], f'{name}{number}', folder)
     return sorted(bodies)
 
 
@@ -105,7 +105,7 @@ def _run(settings: StoreSettings, rules: str = RULES, store: Any = None, **how: 
 
 def _stored(settings: StoreSettings, *sensors: str) -> list[str]:
     """The keys in the store, without the catalog."""
-    found = [entry.key for entry in _source(settings).list('thor/') if schema.is_row(schema.BUCKET, entry.key)]
+    found = [entry.key for entry in _source(settings).list('thor/') if catalog.is_row(catalog.BUCKET, entry.key)]
     return sorted(key for key in found if not sensors or key.split('/')[1] in sensors)
 
 
@@ -181,7 +181,7 @@ def test_what_something_refers_to_stays(settings: StoreSettings) -> None:
     exported, labeled, asked = (row('camera', NOW_NS - age * DAY_NS) for age in (9, 8, 7))
     at_ns = NOW_NS - 6 * DAY_NS
     with closing(open_store(settings, UploadSettings())) as store:
-        of_object = labels.Label(robot='thor', label='door', since_ns=0, until_ns=0, bucket=schema.BUCKET, key=labeled['key'])
+        of_object = labels.Label(robot='thor', label='door', since_ns=0, until_ns=0, bucket=catalog.BUCKET, key=labeled['key'])
         of_time = labels.Label(robot='thor', label='stairs', since_ns=at_ns - SECOND, until_ns=at_ns + SECOND)
         labels.write(store, 'thor', [of_object, of_time], by='me')
         request = pull.put_request(store, source, 'thor', KeptFilter(keys=frozenset({asked['key']})), by='me')
@@ -230,7 +230,7 @@ def test_a_bag_is_deleted_completely_or_not_at_all(settings: StoreSettings, tmp_
     _check(settings)
 
 
-def _repeat(settings: StoreSettings, folder: Path, of: schema.Row, at_ns: int) -> schema.Row:
+def _repeat(settings: StoreSettings, folder: Path, of: catalog.Row, at_ns: int) -> catalog.Row:
     again = {**row('camera', at_ns), 'key': of['key']}
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [again], f'again{at_ns}', folder)
@@ -271,11 +271,11 @@ def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp
     young = row('camera', NOW_NS)
     old_ns = NOW_NS - 9 * DAY_NS
     forged = {**row('camera', old_ns + MINUTE_NS), 'key': young['key']}
-    said = {**dict.fromkeys(schema.FORGOTTEN.columns), **{name: young[name] for name in ('bucket', 'key', 'bytes', 't_start_ns')},
-            'forgotten_ns': NOW_NS, 'format_version': 1}  # fmt: skip
+    known = {name: young[name] for name in ('bucket', 'key', 'bytes', 't_start_ns')}
+    said = {**dict.fromkeys(catalog.FORGOTTEN.columns), **known, 'forgotten_ns': NOW_NS, 'format_version': 1}  # fmt: skip
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [forged], 'forged', tmp_path / 'tmp')
-        body = encode([said], schema.FORGOTTEN)
+        body = encode([said], catalog.FORGOTTEN)
         add(store, tmp_path / 'tmp', f'thor/_forgotten/date={utc(NOW_NS):%Y-%m-%d}/thor_x.jsonl.zst', body, {'robot': 'thor'})
     assert _run(settings).objects == 12
     assert young['key'] in _stored(settings)

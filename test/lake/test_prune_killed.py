@@ -24,7 +24,7 @@ from lake.making import DAY_NS, add, add_part, content, row
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prune import forgotten
@@ -74,7 +74,7 @@ def test_killed_during_reads_a_compaction_and_another_prune(seaweed: Tower, tmp_
     """In the end exactly what the rule names is deleted, with one row each; concurrent readers can read all the rest."""
     now_ns, chance = time.time_ns(), random.Random(7)
     ages = range(10)
-    rows: dict[str, schema.Row] = {}
+    rows: dict[str, catalog.Row] = {}
     with closing(open_store(seaweed.store_settings(), UploadSettings())) as store:
         for age in ages:
             begin_ns = now_ns - age * DAY_NS - 6 * 3600 * SECOND
@@ -83,7 +83,7 @@ def test_killed_during_reads_a_compaction_and_another_prune(seaweed: Tower, tmp_
                 add(store, tmp_path / 'bodies', each['key'], content(each['sensor'], each['t_start_ns']))
             add_part(store, of_day, f'day{age}', tmp_path / 'bodies')
             rows |= {each['key']: each for each in of_day}
-    source = Bucket(seaweed.store_settings(), schema.BUCKET)
+    source = Bucket(seaweed.store_settings(), catalog.BUCKET)
     since_ns = now_ns - KEPT_DAYS * DAY_NS
     going = {key for key, each in rows.items() if each['sensor'] == 'camera' and each['t_start_ns'] < since_ns}
     assert len(going) == 6 * A_DAY

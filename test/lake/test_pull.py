@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter, ObjectCount, PullRequest
 from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.core.untrusted import visible
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.lake import labels, link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -140,10 +140,10 @@ def test_thinned_objects_have_their_current_size(tmp_path: Path, seed: int) -> N
     settings = folder_store(tmp_path)
     with closing(open_store(settings, UploadSettings())) as store:
         for number, (name, where, size) in enumerate(found):
-            row = {**schema.row_of(schema.BUCKET, f'thor/{name}', size, '', {}), 'where': where}
-            key = schema.KEPT.part_key('thor', schema.UNDATED, str(number))
-            add(store, tmp_path / 'tmp', key, parts.encode([row], schema.KEPT))
-    rows = lake.known(Bucket(settings, schema.BUCKET), 'thor', KeptFilter(), Findings()).to_pylist()
+            row = {**catalog.row_of(catalog.BUCKET, f'thor/{name}', size, '', {}), 'where': where}
+            key = catalog.KEPT.part_key('thor', catalog.UNDATED, str(number))
+            add(store, tmp_path / 'tmp', key, parts.encode([row], catalog.KEPT))
+    rows = lake.known(Bucket(settings, catalog.BUCKET), 'thor', KeptFilter(), Findings()).to_pylist()
     assert [(row['key'], row['where'], row['bytes']) for row in rows] == [('thor/a', 'robot', 50), ('thor/b', 'lost', 10)]
 
 

@@ -21,7 +21,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.tables import Tables
 from shadowhound_data_logger.stores import open_store
@@ -34,7 +34,7 @@ DAY = {'since': '2026-10-28', 'until': '2026-10-29'}
 
 
 @pytest.fixture(scope='module')
-def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoreSettings, list[schema.Row]]:
+def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoreSettings, list[catalog.Row]]:
     """Two days of a small robot in a folder."""
     root = tmp_path_factory.mktemp('lake')
     return folder_store(root), fill(folder_store(root), root / 'tmp')
@@ -67,12 +67,12 @@ def found(source: Any, **flags: Any) -> list[str]:
     ids=lambda value: str(value)[:40] if isinstance(value, dict) else '',
 )  # fmt: skip
 def test_flags_select_rows(
-    world: tuple[StoreSettings, list[schema.Row]], flags: dict[str, Any], holds: Callable[[schema.Row], bool]
+    world: tuple[StoreSettings, list[catalog.Row]], flags: dict[str, Any], holds: Callable[[catalog.Row], bool]
 ) -> None:
     """The answer is what a loop over all rows finds."""
     settings, rows = world
     expected = keys([row for row in rows if holds(row)])
-    assert found(Bucket(settings, schema.BUCKET), **flags) == expected
+    assert found(Bucket(settings, catalog.BUCKET), **flags) == expected
     assert bool(expected) != (flags == {'robot': 'tachi'}), 'a question that nothing answers proves nothing'
 
 
@@ -92,14 +92,14 @@ def test_near_a_place_on_earth(tmp_path: Path, near: Any, numbers: list[int]) ->
     rows = [row('camera', NOON_NS + number * SECOND, **({'gps': gps} if gps else {})) for number, gps in enumerate(places)]
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, rows, '20261028T120000_boot', tmp_path / 'tmp')
-    assert found(Bucket(settings, schema.BUCKET), near_gps=near) == keys([rows[number] for number in numbers])
+    assert found(Bucket(settings, catalog.BUCKET), near_gps=near) == keys([rows[number] for number in numbers])
 
 
 @pytest.mark.parametrize('near', ['1,2', '91,0,5', '0,181,5', '0,0,0', '0,0,nan', 'a,b,c', (0.0, 0.0)])
-def test_what_is_no_place_on_earth(world: tuple[StoreSettings, list[schema.Row]], near: Any) -> None:
+def test_what_is_no_place_on_earth(world: tuple[StoreSettings, list[catalog.Row]], near: Any) -> None:
     """It is refused, with what would be one."""
     with pytest.raises(SettingError, match='near_gps'):
-        found(Bucket(world[0], schema.BUCKET), near_gps=near)
+        found(Bucket(world[0], catalog.BUCKET), near_gps=near)
 
 
 def test_by_received_a_time_is_that_of_the_arrival(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_by_received_a_time_is_that_of_the_arrival(tmp_path: Path) -> None:
     rows = [row('camera', NOON_NS, **told), row('odom', NOON_NS)]
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, rows, '20261028T120000_boot', tmp_path / 'tmp')
-    source, next_day = Bucket(settings, schema.BUCKET), {'since': '2026-10-29', 'until': '2026-10-30'}
+    source, next_day = Bucket(settings, catalog.BUCKET), {'since': '2026-10-29', 'until': '2026-10-30'}
     (camera,), (odom,) = (keys([each]) for each in rows)
     assert (found(source, **DAY), found(source, **next_day)) == (sorted([camera, odom]), [])
     assert found(source, **DAY, by='received') == [odom], 'it has no time of arrival: its robot dated it by its own clock'
@@ -122,12 +122,12 @@ def test_by_received_a_time_is_that_of_the_arrival(tmp_path: Path) -> None:
         found(source, by='arrival')
 
 
-def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
     """Names, order and values; times in UTC."""
     settings, rows = world
-    answer = lake.objects(Bucket(settings, schema.BUCKET), sensor='camera', order='t_start_ns', limit=1).to_pylist()
+    answer = lake.objects(Bucket(settings, catalog.BUCKET), sensor='camera', order='t_start_ns', limit=1).to_pylist()
     first = min((row for row in rows if row['sensor'] == 'camera'), key=lambda row: row['t_start_ns'])
-    assert list(answer[0]) == list(schema.COLUMNS)
+    assert list(answer[0]) == list(catalog.COLUMNS)
     times = {'t_start', 't_end'}
     assert {name: value for name, value in answer[0].items() if name not in times} == {
         name: value for name, value in first.items() if name not in times
@@ -153,16 +153,16 @@ def test_rows_of_a_store_that_was_replaced_are_forgotten(tmp_path: Path) -> None
     """A folder, or the address of a server, that now holds something else."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,))
-    assert len(found(Bucket(settings, schema.BUCKET))) == 192
+    assert len(found(Bucket(settings, catalog.BUCKET))) == 192
     shutil.rmtree(settings.directory)
     rows = fill(settings, tmp_path / 'tmp', days=(1,), hours=(11,))
-    assert found(Bucket(settings, schema.BUCKET)) == keys(rows)
+    assert found(Bucket(settings, catalog.BUCKET)) == keys(rows)
 
 
-def test_sql_over_the_views(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+def test_sql_over_the_views(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
     """``objects``, ``topics`` and ``missions`` agree with one another, within the flags."""
-    source = Bucket(world[0], schema.BUCKET)
-    day = [row for row in world[1] if schema.date_of(row) == '2026-10-28']
+    source = Bucket(world[0], catalog.BUCKET)
+    day = [row for row in world[1] if catalog.date_of(row) == '2026-10-28']
     counted = lake.sql('SELECT sensor, count(*) AS n FROM objects GROUP BY sensor ORDER BY sensor', source, **DAY).to_pydict()
     assert counted == {'sensor': ['camera', 'odom'], 'n': [len(day) // 2, len(day) // 2]}
     topics = lake.sql('SELECT topic, objects, messages FROM topics ORDER BY topic', source, **DAY).to_pydict()
@@ -185,7 +185,7 @@ def test_a_senseless_summary_costs_its_own_figures_alone(tmp_path: Path, told: s
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/missions/run-odd/summary.json', told.encode())
         add_part(store, [untyped], 'odd', tmp_path / 'tmp')
-    every = {one['mission_id']: one for one in lake.missions(Bucket(settings, schema.BUCKET)).to_pylist()}
+    every = {one['mission_id']: one for one in lake.missions(Bucket(settings, catalog.BUCKET)).to_pylist()}
     assert (every[FAILED]['success'], every[FINISHED]['success']) == (False, True)
     assert (every['odd']['distance_m'], every['odd']['success'], every['odd']['mission_type']) == (None, None, None)
 
@@ -194,16 +194,16 @@ def test_a_file_that_goes_while_a_folder_is_listed_is_no_error(tmp_path: Path) -
     """As those do that a compacted one stands for."""
     settings = folder_store(tmp_path)
     rows = fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
-    gone = settings.directory / schema.BUCKET / 'thor/_catalog/date=2026-10-28/gone.parquet'
+    gone = settings.directory / catalog.BUCKET / 'thor/_catalog/date=2026-10-28/gone.parquet'
     gone.symlink_to(tmp_path / 'nowhere')
-    assert len(lake.objects(Bucket(settings, schema.BUCKET))) == len(rows)
+    assert len(lake.objects(Bucket(settings, catalog.BUCKET))) == len(rows)
 
 
 def test_a_mission_without_a_summary_has_no_end(tmp_path: Path) -> None:
     """It is still running, or its robot is unreachable: neither failed nor succeeded."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
-    source = Bucket(settings, schema.BUCKET)
+    source = Bucket(settings, catalog.BUCKET)
     source.delete(f'thor/missions/run-{FAILED}/summary.json')
     store = open_store(settings, UploadSettings())
     add(store, tmp_path / 'tmp', 'thor/missions/run-x/summary.json', b'{broken')
@@ -219,7 +219,7 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
     packed, manifest = Spark(tmp_path / 'spark').packed(7)
-    source = Bucket(settings, schema.BUCKET)
+    source = Bucket(settings, catalog.BUCKET)
     for mission, policy in ((FAILED, manifest.id), (FINISHED, f'{manifest.name}@7#{16 * "0"}')):
         key = f'thor/missions/run-{mission}/summary.json'
         told = json.loads(source.get(key, 1 << 20)) | {'policy': policy}
@@ -256,7 +256,7 @@ def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path:
     fill(settings, tmp_path / 'tmp', days=(), hours=())
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, early, 'early', tmp_path / 'tmp')
-    source = Bucket(settings, schema.BUCKET)
+    source = Bucket(settings, catalog.BUCKET)
     frames = sorted(each['key'] for each in rows if each['sensor'] == 'camera' and each['mission_id'] == FAILED)
     assert found(source, sensor='camera', success=False) == frames
     assert found(source, sensor='camera', mission='run-mfail', **DAY) == found(source, sensor='camera', mission=FAILED) == frames
@@ -275,16 +275,16 @@ def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path:
     ],
 )
 def test_what_is_no_question_is_one_kind_of_error(
-    world: tuple[StoreSettings, list[schema.Row]], ask: Callable[[Any], object]
+    world: tuple[StoreSettings, list[catalog.Row]], ask: Callable[[Any], object]
 ) -> None:
     """A LakeError that says what the engine could not make sense of."""
     with pytest.raises(LakeError, match='cannot be answered'):
-        ask(Bucket(world[0], schema.BUCKET))
+        ask(Bucket(world[0], catalog.BUCKET))
 
 
 def test_a_lake_that_is_not_there_is_empty(tmp_path: Path) -> None:
     """No store yet, no catalog yet: no rows, no error."""
-    source = Bucket(folder_store(tmp_path), schema.BUCKET)
+    source = Bucket(folder_store(tmp_path), catalog.BUCKET)
     assert found(source) == []
     assert lake.missions(source).to_pydict()['mission_id'] == []
     assert lake.topics(source, **DAY).to_pydict()['topic'] == []
@@ -313,14 +313,14 @@ def test_only_that_day_is_read_from_a_real_server(seaweed: Tower, tmp_path: Path
     with Recorder(seaweed.endpoint_url) as front:
         front.targets = []
         settings = through(front, seaweed)
-        source = Watched(Bucket(settings, schema.BUCKET))
+        source = Watched(Bucket(settings, catalog.BUCKET))
         answer = lake.objects(source, **DAY, robot='thor', near=(3.0, 1.5, 2.0), where='battery_pct < 62')['key'].to_pylist()
         dated = [target for target in front.targets if 'date' in target]
         assert len(dated) == 25
         assert all('date%3D2026-10-28' in target or 'date=2026-10-28' in target for target in dated)
     expected = [
         row for row in rows
-        if schema.date_of(row) == '2026-10-28' and row['battery_pct'] < 62 and (row['x'] - 3) ** 2 + (row['y'] - 1.5) ** 2 <= 4
+        if catalog.date_of(row) == '2026-10-28' and row['battery_pct'] < 62 and (row['x'] - 3) ** 2 + (row['y'] - 1.5) ** 2 <= 4
     ]  # fmt: skip
     assert sorted(answer) == keys(expected)
     assert expected
@@ -335,7 +335,7 @@ def test_wrong_credentials_are_reported_without_showing_them(seaweed: Tower) -> 
     plain = seaweed.store_settings()
     wrong = StoreSettings(endpoint_url=plain.endpoint_url, access_key_id=plain.access_key_id, secret_access_key='not the secret')
     with pytest.raises(CredentialsRejected) as caught:
-        lake.objects(Bucket(wrong, schema.BUCKET))
+        lake.objects(Bucket(wrong, catalog.BUCKET))
     assert plain.access_key_id not in str(caught.value)
     assert 'not the secret' not in str(caught.value)
     assert 'AWS_SECRET_ACCESS_KEY' in str(caught.value)
@@ -355,10 +355,10 @@ def test_missing_credentials_are_reported(
         monkeypatch.delenv(name)
     monkeypatch.setenv('HOME', str(tmp_path))
     with pytest.raises(error, match=says):
-        Bucket(StoreSettings(endpoint_url='http://127.0.0.1:9', **keys), schema.BUCKET).folders('')
+        Bucket(StoreSettings(endpoint_url='http://127.0.0.1:9', **keys), catalog.BUCKET).folders('')
 
 
-def test_a_source_can_be_sent_to_another_process(world: tuple[StoreSettings, list[schema.Row]]) -> None:
+def test_a_source_can_be_sent_to_another_process(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
     """As Ray does it."""
-    source = pickle.loads(pickle.dumps(Bucket(world[0], schema.BUCKET)))  # noqa: S301 - our own
+    source = pickle.loads(pickle.dumps(Bucket(world[0], catalog.BUCKET)))  # noqa: S301 - our own
     assert len(found(source, **DAY)) == len(world[1]) // 2

@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake import reindex as library
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores import open_store
@@ -46,11 +46,11 @@ ALL = sorted([*keys(ROWS), 'thor/patrol_20261028_120000.csv'])
 
 def run(settings: StoreSettings, robot: str = 'thor') -> library.Reindexed:
     with closing(open_store(settings, UploadSettings())) as store:
-        return library.reindex(Bucket(settings, schema.BUCKET), store, robot)
+        return library.reindex(Bucket(settings, catalog.BUCKET), store, robot)
 
 
 def answer(settings: StoreSettings, **flags: Any) -> list[str]:
-    return sorted(lake.objects(Bucket(settings, schema.BUCKET), **flags)['key'].to_pylist())
+    return sorted(lake.objects(Bucket(settings, catalog.BUCKET), **flags)['key'].to_pylist())
 
 
 def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
@@ -58,9 +58,9 @@ def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
     found = run(settings)
     assert (found.listed, found.added, found.gone) == (9, 9, 0)
     assert answer(settings) == ALL
-    made = {one['key']: one for one in lake.objects(Bucket(settings, schema.BUCKET), robot='thor').to_pylist()}
+    made = {one['key']: one for one in lake.objects(Bucket(settings, catalog.BUCKET), robot='thor').to_pylist()}
     for expected in ROWS:
-        kept = {name for name in schema.COLUMNS if name not in {'t_start', 't_end', 'mission_id', 'run_id', 'mission_type'}}
+        kept = {name for name in catalog.COLUMNS if name not in {'t_start', 't_end', 'mission_id', 'run_id', 'mission_type'}}
         assert {name: made[expected['key']][name] for name in kept} == {name: expected[name] for name in kept}
     assert run(settings).added == 0
     assert answer(settings) == ALL
@@ -81,7 +81,7 @@ def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, t
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES[:3]], 'late', tmp_path / 'tmp')
         assert answer(settings) == ALL
-        assert len(lake.objects(Bucket(settings, schema.BUCKET), sensor='camera')) == len(TIMES)
+        assert len(lake.objects(Bucket(settings, catalog.BUCKET), sensor='camera')) == len(TIMES)
         merge(settings)
         assert answer(settings) == ALL
         add_part(store, [row('camera', TIMES[0])], 'later', tmp_path / 'tmp')

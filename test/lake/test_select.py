@@ -9,7 +9,7 @@ from lake.making import DAY_NS, NOON_NS
 
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import SettingError
-from shadowhound_data_logger.formats.rows.schema import UNDATED
+from shadowhound_data_logger.formats.rows.catalog import UNDATED
 from shadowhound_data_logger.lake.select import Wanted, wanted
 
 MIDNIGHT_NS = NOON_NS - DAY_NS // 2

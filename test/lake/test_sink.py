@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError, SinkUnavailable
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows.gaps import WITHDRAWN
 from shadowhound_data_logger.lake import labels, sink
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -175,10 +175,10 @@ def test_pruned_objects_are_marked(url: str, settings: StoreSettings, tmp_path: 
     """Its document keeps all fields, whenever the deletion is sent, and exists once."""
     with closing(open_store(settings, UploadSettings())) as store:
         row = fill_row()
-        told = {name: row[name] for name in schema.FORGOTTEN.columns if name in row}
+        told = {name: row[name] for name in catalog.FORGOTTEN.columns if name in row}
         told |= {'rule': 'camera 90d', 'forgotten': NOON_NS // 1000, 'forgotten_ns': NOON_NS}
-        key = schema.FORGOTTEN.part_key('thor', schema.date_of(row), 'x')
-        add(store, tmp_path, key, parts.encode([told], schema.FORGOTTEN))
+        key = catalog.FORGOTTEN.part_key('thor', catalog.date_of(row), 'x')
+        add(store, tmp_path, key, parts.encode([told], catalog.FORGOTTEN))
     send(url, settings, tmp_path)
     assert send(url, settings, tmp_path).added == 0
     assert counts(url) == COUNTS
@@ -188,7 +188,7 @@ def test_pruned_objects_are_marked(url: str, settings: StoreSettings, tmp_path: 
     assert (said['sha256'], said['position']['x']) == (row['sha256'], row['x'])
 
 
-def fill_row() -> schema.Row:
+def fill_row() -> catalog.Row:
     """One of the lake's, a frame."""
     _, rows = next(minutes(days=(0,), hours=(11,)))
     return rows[0]

@@ -31,8 +31,8 @@ from shadowhound_tower.embedded import Tower
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.formats.rows.gaps import GAPS
-from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

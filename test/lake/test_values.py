@@ -20,7 +20,7 @@ from lake.making import NOON_NS, add, folder_store, merge
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import SettingError
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
 from shadowhound_data_logger.formats.statistics import MAX_FIELDS, FieldStatistics
 from shadowhound_data_logger.lake import query, values
@@ -65,17 +65,17 @@ def filled(root: Path, batches: list[list[dict[str, Any]]], told: list[bool], ch
             metadata = {'robot': 'thor', 'sensor': 's', 'topic': '/s', 'type': 'x/msg/S', 'count': str(len(messages)),
                         'sha256': hashlib.sha256(content).hexdigest(), 't_start_ns': str(begin_ns),
                         't_end_ns': str(begin_ns + (len(messages) - 1) * SECOND // 10)}  # fmt: skip
-            row = schema.row_of(schema.BUCKET, key, len(content), 'application/json', metadata)
+            row = catalog.row_of(catalog.BUCKET, key, len(content), 'application/json', metadata)
             rows.append(row)
             if is_told:
                 found = FieldStatistics(chosen)
                 found.add(orjson.loads(content)['samples'])
                 statistics += statistic_rows(row, found.result())
-        add(store, root, schema.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
+        add(store, root, catalog.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
         for name in 'ab' if statistics else '':  # delivered twice, as after a power cut
             key = STATISTICS.part_key('thor', '2026-10-28', f'20261028T12000{"ab".index(name)}_{name}')
             add(store, root, key, parts.encode(statistics, STATISTICS))
-    return Bucket(store_settings, schema.BUCKET)
+    return Bucket(store_settings, catalog.BUCKET)
 
 
 # -- the oracle: a loop that does not use statistics ---------------------------------------------------------------------------
@@ -334,9 +334,9 @@ def slow(root: Path, stamps_s: list[float], values_: list[float]) -> Bucket:
             metadata = {'robot': 'thor', 'sensor': 's', 'topic': '/s', 'type': 'x/msg/S', 'count': '1',
                         'sha256': hashlib.sha256(content).hexdigest(), 't_start_ns': str(stamp_ns),
                         't_end_ns': str(stamp_ns)}  # fmt: skip
-            rows.append(schema.row_of(schema.BUCKET, key, len(content), 'application/json', metadata))
-        add(store, root, schema.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
-    return Bucket(settings_, schema.BUCKET)
+            rows.append(catalog.row_of(catalog.BUCKET, key, len(content), 'application/json', metadata))
+        add(store, root, catalog.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
+    return Bucket(settings_, catalog.BUCKET)
 
 
 @pytest.mark.parametrize('period_s', [1.0, 5.0])

@@ -19,7 +19,7 @@ from shadowhound_data_logger import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake import prune
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -47,7 +47,7 @@ def with_bucket(server: Tower) -> None:
 
 
 def of(server: Tower, user: str) -> Bucket:
-    return Bucket(server.store_settings(user), schema.BUCKET)
+    return Bucket(server.store_settings(user), catalog.BUCKET)
 
 
 def found(source: Bucket, **flags: object) -> list[str]:
@@ -131,7 +131,7 @@ def test_an_object_is_deleted_after_the_tables_name_it_as_deleted(server: Tower,
 
 def test_vacuum_keeps_what_a_query_as_of_a_time_within_the_last_month_needs(tmp_path: Path) -> None:
     """Files that were merged are not deleted before."""
-    source = Bucket(folder_store(tmp_path), schema.BUCKET)
+    source = Bucket(folder_store(tmp_path), catalog.BUCKET)
     fill(source.settings, tmp_path / 'tmp', days=(0,))
     lake.objects(source)
     merge(source.settings)

@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.lake import MissionDataset
 from shadowhound_data_logger.stores import open_store
 
@@ -71,7 +71,7 @@ class Drive:
         self.settings, self.robot = settings, robot
         self._ros = _ros()
         self._folder = tmp / 'bodies'
-        self.rows: list[schema.Row] = []
+        self.rows: list[catalog.Row] = []
         self.late_ns: dict[str, int] = {}
         """Sensor -> how much later than their stamps its messages arrive."""
         self.has_arrivals = True
@@ -99,7 +99,7 @@ class Drive:
                 metadata = {**(received if self.has_arrivals else {}), **metadata}
                 add(store, self._folder, one.key, body, metadata, content_type=one.content_type)
                 told = {**metadata, 'sha256': hashlib.sha256(body).hexdigest()}
-                rows.append(schema.row_of(one.bucket, one.key, len(body), one.content_type, told))
+                rows.append(catalog.row_of(one.bucket, one.key, len(body), one.content_type, told))
             add_part(store, rows, f'part{len(self.rows)}', self._folder)
         self.rows += rows
 
@@ -109,7 +109,7 @@ class Drive:
         for one, metadata in told:
             assert isinstance(one.body, bytes)
             sha256 = hashlib.sha256(one.body).hexdigest()
-            rows.append(schema.row_of(one.bucket, one.key, len(one.body), one.content_type, {**metadata, 'sha256': sha256}))
+            rows.append(catalog.row_of(one.bucket, one.key, len(one.body), one.content_type, {**metadata, 'sha256': sha256}))
         with closing(open_store(self.settings, UploadSettings())) as store:
             add_part(store, rows, f'part{len(self.rows)}', self._folder)
         self.rows += rows

@@ -32,7 +32,7 @@ from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, UploadSettings
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
-from shadowhound_data_logger.formats.rows.schema import BUCKET, Row, row_of
+from shadowhound_data_logger.formats.rows.catalog import BUCKET, Row, row_of
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.live import history as module

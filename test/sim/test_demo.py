@@ -29,8 +29,8 @@ from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.formats.rows.catalog import row_of
 from shadowhound_data_logger.formats.rows.parts import encode
-from shadowhound_data_logger.formats.rows.schema import row_of
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool.spool import Spool
 

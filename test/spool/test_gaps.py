@@ -316,7 +316,7 @@ def test_what_waits_while_a_full_disk_empties_is_not_settled(spool: Spool, monke
     items = spool.commit([make('a')])
     hear(spool, 2)
     writer = SpoolWriter(spool, 0.0)
-    monkeypatch.setattr(spool, 'fits', lambda _: False)
+    monkeypatch.setattr(spool.room, 'fits', lambda _: False)
     told = []
     writer.on_commit(settled=lambda _: told.append(watermark(spool)))
     writer.put(make('b'))

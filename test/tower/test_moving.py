@@ -23,7 +23,7 @@ from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.config import UploadSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog as catalog_rows
 from shadowhound_data_logger.stores import open_store
 
 pytestmark = [
@@ -73,7 +73,7 @@ class Towers:
                 told = {'robot': 'thor', 't_start_ns': str(NOON_NS)}
                 add(store, self.tmp / 'tmp', key, body, told, bucket=bucket, content_type='image/jpeg')
                 told['sha256'] = hashlib.sha256(body).hexdigest()
-                rows.append(schema.row_of(bucket, key, len(body), 'image/jpeg', told))
+                rows.append(catalog_rows.row_of(bucket, key, len(body), 'image/jpeg', told))
             add_part(store, rows, name, self.tmp / 'tmp')
 
     def copy(self) -> str:

@@ -16,7 +16,7 @@ import hashlib
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, utc
-from shadowhound_data_logger.formats.rows.schema import GAPS_FOLDER, INT32, INT64, STRING, TIME, UNDATED, TableSchema
+from shadowhound_data_logger.formats.rows.catalog import GAPS_FOLDER, INT32, INT64, STRING, TIME, UNDATED, TableSchema
 
 FORMAT_VERSION: Final = 1
 """Version of the statements. Columns are only ever added, at the end."""

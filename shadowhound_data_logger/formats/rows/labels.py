@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from shadowhound_data_logger.formats.rows.schema import DOUBLE, INT32, INT64, LABELS_FOLDER, STRING, TIME, TableSchema
+from shadowhound_data_logger.formats.rows.catalog import DOUBLE, INT32, INT64, LABELS_FOLDER, STRING, TIME, TableSchema
 
 LABEL, REMOVED = 'label', 'removed'
 LABEL_KINDS: Final = (LABEL, REMOVED)

@@ -16,9 +16,7 @@ import orjson
 
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.zstd import DecompressionParameter, ZstdDecompressor, ZstdError, compress
-from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS, WITHDRAWN
-from shadowhound_data_logger.formats.rows.labels import LABEL_KINDS, LABELS
-from shadowhound_data_logger.formats.rows.schema import (
+from shadowhound_data_logger.formats.rows.catalog import (
     DOUBLE,
     FORGOTTEN,
     INT32,
@@ -31,6 +29,8 @@ from shadowhound_data_logger.formats.rows.schema import (
     TableSchema,
     date_of,
 )
+from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS, WITHDRAWN
+from shadowhound_data_logger.formats.rows.labels import LABEL_KINDS, LABELS
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.formats.statistics import NUMBERS
 

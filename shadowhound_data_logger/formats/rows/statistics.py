@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from shadowhound_data_logger.formats.rows.schema import DOUBLE, INT32, INT64, STATISTICS_FOLDER, STRING, TIME, Row, TableSchema
+from shadowhound_data_logger.formats.rows.catalog import DOUBLE, INT32, INT64, STATISTICS_FOLDER, STRING, TIME, Row, TableSchema
 from shadowhound_data_logger.formats.statistics import NUMBERS, Statistic, numbers_of
 
 FORMAT_VERSION: Final = 1

@@ -1,1 +1,1 @@
-"""Encodes batches of messages into objects for the spool."""
+"""Encodes batches of messages into objects for the spool, with the encoders of ``formats/``."""

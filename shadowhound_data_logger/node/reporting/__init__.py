@@ -1,1 +1,1 @@
-"""The status, diagnostics, the watchdog and the control socket of the node."""
+"""The status, diagnostics, the watchdog, the control socket and the bookkeeping objects of the node."""

@@ -17,17 +17,17 @@ from hypothesis import strategies as st
 from profiles import examples
 
 from shadowhound_data_logger.core.zstd import compress
-from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows import catalog, parts
 from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS, statement
 
 INTS = st.integers(-(1 << 63), (1 << 63) - 1)
 TEXT = st.text(st.characters(exclude_categories=['Cs']))
 VALUES: dict[str, st.SearchStrategy[Any]] = {
-    schema.STRING: TEXT,
-    schema.INT32: st.integers(-(1 << 31), (1 << 31) - 1),
-    schema.INT64: INTS,
-    schema.DOUBLE: st.floats(allow_nan=False, allow_infinity=False),
-    schema.TIME: st.integers(-62_135_596_800_000_000, 253_402_300_799_999_999),
+    catalog.STRING: TEXT,
+    catalog.INT32: st.integers(-(1 << 31), (1 << 31) - 1),
+    catalog.INT64: INTS,
+    catalog.DOUBLE: st.floats(allow_nan=False, allow_infinity=False),
+    catalog.TIME: st.integers(-62_135_596_800_000_000, 253_402_300_799_999_999),
 }
 GIVEN = {
     'robot': st.just('thor'),
@@ -37,22 +37,22 @@ GIVEN = {
 }
 ROWS = st.lists(
     st.fixed_dictionaries({
-        name: (VALUES | GIVEN).get(name, VALUES[kind]) if name in schema.REQUIRED else st.none() | GIVEN.get(name, VALUES[kind])
-        for name, kind in schema.COLUMNS.items()
+        name: (VALUES | GIVEN).get(name, VALUES[kind]) if name in catalog.REQUIRED else st.none() | GIVEN.get(name, VALUES[kind])
+        for name, kind in catalog.COLUMNS.items()
     }),
     min_size=1,
     max_size=12,
 )  # fmt: skip
 
 
-def some(count: int) -> list[schema.Row]:
+def some(count: int) -> list[catalog.Row]:
     """Rows of a camera and of a lidar without a mission."""
     rows = []
     for number in range(count):
         ns = 1_760_788_800_000_000_000 + number * 500_000_000
         told = {'robot': 'thor', 'sensor': 'camera', 't_start_ns': str(ns), 't_end_ns': str(ns), 'sha256': f'{number:064x}',
                 'pose': f'{number}.5 -1.0 0.5 odom', 'run_id': 'r1'}  # fmt: skip
-        rows.append(schema.row_of('sensor-data', f'thor/camera/{number:06d}.jpg', number, 'image/jpeg', told))
+        rows.append(catalog.row_of('sensor-data', f'thor/camera/{number:06d}.jpg', number, 'image/jpeg', told))
     for row in rows[::3]:
         row.update(run_id=None, x=None, y=None, yaw=None, pose_frame=None, sensor='lidar')
     return rows
@@ -66,7 +66,7 @@ def line(**changed: Any) -> bytes:
 
 @settings(deadline=None, max_examples=examples(50))
 @given(ROWS)
-def test_every_value_reads_back(rows: list[schema.Row]) -> None:
+def test_every_value_reads_back(rows: list[catalog.Row]) -> None:
     """Also nulls, the largest numbers, -0.0 and text of any script."""
     found = parts.read_rows(parts.encode(rows), 'thor')
     assert (found.rows, found.findings) == ({'_catalog': rows}, '')
@@ -191,7 +191,7 @@ def test_whatever_is_in_a_file_the_reader_returns(data: st.DataObject) -> None:
     """Damaged files of ours and lines of any JSON; no row that is returned names another robot."""
     json = st.recursive(st.none() | st.booleans() | INTS | st.floats(allow_nan=False, allow_infinity=False) | TEXT,
                         lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT, inner, max_size=3))  # fmt: skip
-    known = st.dictionaries(st.sampled_from([*schema.COLUMNS, *GAPS.columns]), json, max_size=9)
+    known = st.dictionaries(st.sampled_from([*catalog.COLUMNS, *GAPS.columns]), json, max_size=9)
     lines = data.draw(st.lists(st.tuples(st.sampled_from([*parts.KINDS]), known), max_size=5))
     body = bytearray(compress(b''.join(orjson.dumps({**row, 'row': kind}) + b'\n' for kind, row in lines) + line()))
     for place, value in data.draw(st.lists(st.tuples(st.integers(0, len(body) - 1), st.integers(0, 255)), max_size=3)):

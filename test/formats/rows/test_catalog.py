@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.keys import check_key
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 
 NOON_NS = 1_760_788_800 * SECOND
 CAMERA = 'thor/camera/20251018/120000_front.jpg'
@@ -22,14 +22,14 @@ TOLD = {
 }  # fmt: skip
 
 
-def row(metadata: dict[str, str], key: str = CAMERA, bucket: str = 'sensor-data') -> schema.Row:
-    return schema.row_of(bucket, key, 50_000, 'image/jpeg', metadata)
+def row(metadata: dict[str, str], key: str = CAMERA, bucket: str = 'sensor-data') -> catalog.Row:
+    return catalog.row_of(bucket, key, 50_000, 'image/jpeg', metadata)
 
 
 def test_a_row_has_all_metadata_of_the_object() -> None:
     """Each column has its value, in the order of the columns."""
     found = row(TOLD)
-    assert list(found) == list(schema.COLUMNS)
+    assert list(found) == list(catalog.COLUMNS)
     assert found == {
         'robot': 'thor', 'sensor': 'camera', 'topic': '/camera/compressed', 'type': 'sensor_msgs/msg/CompressedImage',
         'bucket': 'sensor-data', 'key': CAMERA, 'bytes': 50_000, 'sha256': 'ab' * 32, 't_start': NOON_NS // 1000,
@@ -71,8 +71,8 @@ def test_a_time_since_boot_is_no_date() -> None:
     found = row(told, 'thor/_unsynced/b/camera/00000005_000_camera.jpg')
     assert (found['t_start_ns'], found['t_end_ns']) == (5 * SECOND, 6 * SECOND)
     assert (found['t_start'], found['t_end']) == (None, None)
-    assert schema.date_of(found) == '1970-01-01'
-    assert schema.date_of(row(TOLD)) == '2025-10-18'
+    assert catalog.date_of(found) == '1970-01-01'
+    assert catalog.date_of(row(TOLD)) == '2025-10-18'
 
 
 def test_a_slice_of_a_bag_counts_its_messages() -> None:
@@ -86,15 +86,15 @@ def test_nothing_in_metadata_or_key_raises(metadata: dict[str, str], key: str) -
     """Whatever a foreign writer put there, there is a row with whole numbers of 64 bits, and a folder for it."""
     found = row(metadata, key)
     assert all(abs(value) < 1 << 63 for value in found.values() if isinstance(value, int))
-    assert re.fullmatch(r'\d{4}-\d\d-\d\d', schema.date_of(found))
+    assert re.fullmatch(r'\d{4}-\d\d-\d\d', catalog.date_of(found))
 
 
 def test_the_catalog_is_not_in_itself() -> None:
     """Everything else is, also another bucket's folder of that name."""
-    key = schema.OBJECTS.part_key('thor', '2025-10-18', '20251018T120100_b00t')
+    key = catalog.OBJECTS.part_key('thor', '2025-10-18', '20251018T120100_b00t')
     assert check_key(key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120100_b00t.jsonl.zst'
-    assert key.startswith(schema.OBJECTS.prefix('thor'))
-    assert not schema.is_row('sensor-data', key)
-    assert schema.is_row('trajectories', key)
-    assert schema.is_row('sensor-data', CAMERA)
-    assert schema.is_row('sensor-data', 'thor/_ledger/20251018/120000_ledger.json')
+    assert key.startswith(catalog.OBJECTS.prefix('thor'))
+    assert not catalog.is_row('sensor-data', key)
+    assert catalog.is_row('trajectories', key)
+    assert catalog.is_row('sensor-data', CAMERA)
+    assert catalog.is_row('sensor-data', 'thor/_ledger/20251018/120000_ledger.json')
