@@ -61,7 +61,7 @@ def flow(profile: Profile) -> Iterator[tuple[str, ...]]:
     for robots in FLEETS:
         objects = robots * profile.objects_s
         yield (
-            f'{robots:,}', f'{robots * profile.bytes_s * 8 / 1e6:,.0f} Mbit/s', f'{objects:,.1f}', f'{objects * DAY_S:,.0f}',
+            f'{robots:,}', f'{robots * profile.bytes_s * 8 / 1e6:,.0f} Mbit/s', f'{objects:,.1f}',
             size(robots * profile.bytes_s * DAY_S), size(robots * profile.bytes_s * DAY_S * 365), f'{objects / PUTS_A_CORE:,.2f}',
         )  # fmt: skip
 
@@ -103,7 +103,6 @@ HEADS: Final = {
         'robots',
         'network, while they work',
         'objects per second',
-        'objects per day',
         'bytes per day',
         'bytes per year',
         'cores that take it',

@@ -129,11 +129,11 @@ def console() -> Console:
 def _examine(checks: Sequence[Check], context: Context, timeout_s: float) -> list[Result]:
     """Checks in progress are shown on standard error if that is a terminal."""
     waiting = [check.name for check in checks]
-    with progress(f'asking {", ".join(waiting)}') as bar:
+    with progress(f'checking {", ".join(waiting)}') as bar:
 
         def on_end(check: Check) -> None:
             waiting.remove(check.name)
-            bar.say(f'asking {", ".join(waiting)}')
+            bar.say(f'checking {", ".join(waiting)}')
 
         return Examination(checks, context, timeout_s=timeout_s, on_end=on_end).run()
 

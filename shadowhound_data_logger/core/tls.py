@@ -11,11 +11,11 @@ _NOT_YET, _EXPIRED, _HOST, _ADDRESS = 9, 10, 62, 64
 """X509_V_ERR_CERT_NOT_YET_VALID, _CERT_HAS_EXPIRED, _HOSTNAME_MISMATCH, _IP_ADDRESS_MISMATCH of OpenSSL's x509_vfy.h."""
 _OTHER_NAME: Final = (
     'the certificate of {server} is for another name',
-    'use a name that is in it (subjectAltName) in {address}, or create one on Tower with this name',
+    'use a name that is in it (subjectAltName) in {address}, or create one on the server with this name',
 )
 _REASONS: Final = {
     _NOT_YET: ('the certificate of {server} is not valid yet', 'set the clock of this machine: `timedatectl`'),
-    _EXPIRED: ('the certificate of {server} has expired', 'renew it on Tower; unless the clock of this machine is ahead: `date`'),
+    _EXPIRED: ('the certificate of {server} has expired', 'renew it on the server, unless this machine is ahead: `date`'),
     _HOST: _OTHER_NAME,
     _ADDRESS: _OTHER_NAME,
 }
@@ -24,7 +24,7 @@ _RUSTLS: Final = {'Expired': _EXPIRED, 'NotValidYet': _NOT_YET, 'NotValidForName
 _RUSTLS_ERROR: Final = re.compile(r'InvalidCertificate\(\s*(\w+?)(?:Context)?\b')
 _AUTHORITY: Final = (
     'the certificate of {server} is a CA certificate, which rustls does not accept from a server',
-    'create one on Tower that the authority signs',
+    'create one on the server that the authority signs',
 )
 _UNKNOWN: Final = (
     'the certificate of {server} is not trusted',

@@ -22,7 +22,7 @@ from shadowhound_data_logger.spool import status
 KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')
 SHARED: Final = (*ENDPOINTS, *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL', 'ROS_DOMAIN_ID')
 """Variables that should be the same for the node and this shell; AWS keys among them are compared, never shown."""
-PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from Tower', '...')
+PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from the server', '...')
 """Placeholders of the guide, left in a variable by copying a command."""
 OF_THE_NODE: Final = 'set -a; . /etc/shadowhound/logger.env; set +a'
 """Loads the variables of the node's service into a shell."""
@@ -56,7 +56,7 @@ def _store(context: Context) -> Iterator[Result]:
             'environment.placeholder',
             f'{" and ".join(pasted)} still has a placeholder from the manual',
             'the command was pasted and not completed',
-            f'export {pasted[0]}=...  # with the values from Tower',
+            f'export {pasted[0]}=...  # with the values from the server',
         )
     if not endpoint:
         if any(problem.data['name'] in ENDPOINTS for problem in context.refused):
@@ -130,8 +130,8 @@ def _tracking(context: Context) -> Iterator[Result]:
     if not uri and context.settings.store.endpoint_url:
         yield warning(
             'environment.tracking',
-            'MLFLOW_TRACKING_URI is not set, though there is a Tower',
-            f'missions are logged to {context.settings.home / "mlflow.db"}, where Tower cannot see them',
+            'MLFLOW_TRACKING_URI is not set, though there is a server',
+            f'missions are logged to {context.settings.home / "mlflow.db"}, where the server cannot see them',
             'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
         )
     elif uri.startswith('http') and services.mlflow(context) is None:
@@ -192,7 +192,7 @@ def _proxies(context: Context) -> Iterator[Result]:
             yield warning(
                 'environment.proxy',
                 f'{names[0]} is set, and {host} is not in NO_PROXY',
-                'requests to Tower are sent to the proxy',
+                'requests to the server are sent to the proxy',
                 f'export NO_PROXY=$NO_PROXY,{host}',
             )
             return

@@ -21,9 +21,9 @@ from shadowhound_data_logger.doctor.model import Context, Result, Role, error, f
 
 NAME: Final = 'mlflow'
 PROBE: Final = '_doctor'
-LOGS: Final = 'on Tower: docker logs --tail 50 mlflow || docker compose logs --tail 50 mlflow'
+LOGS: Final = 'on the server: docker logs --tail 50 mlflow || docker compose logs --tail 50 mlflow'
 S3_OF_SERVER: Final = (
-    "MLflow's own environment on Tower lacks AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY or MLFLOW_S3_ENDPOINT_URL, "
+    "MLflow's own environment on the server lacks AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY or MLFLOW_S3_ENDPOINT_URL, "
     'the bucket is missing, or the S3 server cannot be reached'
 )
 
@@ -46,7 +46,7 @@ def check(context: Context) -> Iterator[Result]:
                 'mlflow.open',
                 f'{service.url} requires no password',
                 'anyone who can reach that port can read, change and delete missions, and administer the server',
-                'on Tower: make tower-secrets, and start MLflow as tower/compose.yaml does (docs/tower.md)',
+                'on the server: make tower-secrets, and start MLflow as tower/compose.yaml does (docs/tower.md)',
             )
         missions = f'{context.settings.robot}_missions'
         found = rest.experiment(missions)
@@ -79,23 +79,23 @@ def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
     if 'Host header' in text:
         cause, remedy = (
             'MLflow only accepts requests for its own host names',
-            'on Tower: mlflow server --allowed-hosts TOWER_IP:5001,...',
+            'on the server: mlflow server --allowed-hosts TOWER_IP:5001,...',
         )
     elif status == 401 and not text.startswith('<'):
         return error(
             'mlflow.login',
             str(problem),
             'it requires a user and password, or different ones: they may have been changed',
-            'export MLFLOW_TRACKING_USERNAME=... MLFLOW_TRACKING_PASSWORD=...  # of tower/secrets/NAME.env on Tower, or '
+            'export MLFLOW_TRACKING_USERNAME=... MLFLOW_TRACKING_PASSWORD=...  # of tower/secrets/NAME.env on the server, or '
             'its NAME.credentials as ~/.mlflow/credentials',
         )
     elif status == 403 and not text.startswith('<'):
         return error(
             'mlflow.login',
             str(problem),
-            'this user has no permission: MLFLOW_TRACKING_USERNAME is that of another machine, or Tower does not know '
+            'this user has no permission: MLFLOW_TRACKING_USERNAME is that of another machine, or the server does not know '
             f'{robot} as a robot',
-            f'on Tower: make tower-secrets TOWER_ARGS="--robot {robot}", start MLflow again, and copy {robot}.env here',
+            f'on the server: make tower-secrets TOWER_ARGS="--robot {robot}", start MLflow again, and copy {robot}.env here',
         )
     elif 400 <= status < 500 or 'like an MLflow server' in str(problem):
         cause, remedy = 'something else listens on this port', f'export {variable}=http://TOWER_IP:5001'
@@ -132,7 +132,7 @@ def _missions(name: str, found: Mapping[str, Any] | None) -> Iterator[Result]:
             'mlflow.missions',
             f'the experiment {name} is deleted',
             'missions wait until it is restored',
-            f'on Tower: mlflow experiments restore -x {found["experiment_id"]}',
+            f'on the server: mlflow experiments restore -x {found["experiment_id"]}',
         )
     elif not _is_folder(where):
         yield ok('mlflow.missions', f'the experiment {name} keeps its artifacts in {where}')
@@ -147,8 +147,8 @@ def _local(who: str, location: str) -> Result:
         'mlflow.artifacts',
         f'{who} keeps its artifacts in {location}, a folder',
         'the server was started with a folder as artifact root and does not serve artifacts: each client writes to its own '
-        'disk, so they reach neither Tower nor its store',
-        'on Tower: mlflow server --artifacts-destination s3://mlflow ...  (and a new experiment: where artifacts go '
+        'disk, so they reach neither the server nor its store',
+        'on the server: mlflow server --artifacts-destination s3://mlflow ...  (and a new experiment: where artifacts go '
         'is fixed when it is created)',
     )
 

@@ -52,8 +52,8 @@ def _check(service: TowerService | None, check: str, context: Context) -> Iterat
         yield error(
             f'{check}.dns',
             f'the name {service.host} cannot be resolved ({problem})',
-            'no DNS server resolves it, or none can be reached: no WiFi, or not the network of Tower',
-            f'getent hosts {service.host}; or use the IP address of Tower: '
+            'no DNS server resolves it, or none can be reached: no WiFi, or not the network of the server',
+            f'getent hosts {service.host}; or use the IP address of the server: '
             f'export {service.variable}=http{"s" * service.tls}://TOWER_IP:{service.port}',
         )
         return
@@ -99,7 +99,7 @@ def _unreachable(service: TowerService, address: str, check: str, problem: OSErr
     where = f'{service.host}:{service.port}'
     if isinstance(problem, ConnectionRefusedError):
         others = [port for port in service.usual_ports if port != service.port and _answers(address, port)]
-        remedy = f'on Tower: sudo ss -ltnp | grep :{service.port} ; docker compose ps'
+        remedy = f'on the server: sudo ss -ltnp | grep :{service.port} ; docker compose ps'
         cause = f'the machine is on, but {service.title} does not run there, or listens on another port or only on localhost'
         if others:
             cause += f'; something answers on port {others[0]}'
@@ -109,8 +109,9 @@ def _unreachable(service: TowerService, address: str, check: str, problem: OSErr
         return error(
             check,
             f'{where} does not answer within {CONNECT_S:g} s',
-            'Tower is off, a firewall drops packets to this port, or the WiFi is disconnected',
-            f'ping -c 3 {service.host} ; on Tower: sudo ufw status | grep {service.port} || sudo ufw allow {service.port}/tcp',
+            'the server is off, a firewall drops packets to this port, or the WiFi is disconnected',
+            f'ping -c 3 {service.host} ; on the server: '
+            f'sudo ufw status | grep {service.port} || sudo ufw allow {service.port}/tcp',
         )
     return error(
         check,
@@ -167,7 +168,7 @@ def _untrusted(service: TowerService, check: str, problem: ssl.SSLCertVerificati
             f'{check}.expired',
             f'the certificate of {service.url} has expired',
             'it was not renewed, or the clock of this machine is ahead',
-            f'{shown} -dates ; date ; renew it on Tower',
+            f'{shown} -dates ; date ; renew it on the server',
         ),
         WRONG_HOST: lambda: error(
             f'{check}.host',
@@ -199,7 +200,7 @@ def check_tower(context: Context) -> Iterator[Result]:
             yield warning(
                 'tower.listen',
                 f'{service.title} listens on 127.0.0.1:{service.port} only',
-                'Thor and Spark cannot reach it',
+                'robots and workstations cannot reach it',
                 'start it with 0.0.0.0 (docker: ports: "9000:9000"), and: '
                 f'sudo ufw allow from 192.168.0.0/16 to any port {service.port} proto tcp',
             )

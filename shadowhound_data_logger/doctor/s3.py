@@ -84,7 +84,7 @@ def check(context: Context) -> Iterator[Result]:
     except SettingError as problem:
         yield from_error('s3.setting', problem)
     except CredentialsRejected as problem:
-        yield from_error('s3.signature', problem, 'the key pair is invalid on this server: mistyped, or changed on Tower')
+        yield from_error('s3.signature', problem, 'the key pair is invalid on this server: mistyped, or changed on the server')
     except StoreError as problem:
         yield _unusable(problem)
 
@@ -122,12 +122,12 @@ def _without_keys(service: TowerService, context: Context) -> Iterator[Result]:
             's3.open',
             'the server lists its buckets without keys',
             'it was started without credentials: every client that can reach it has full access',
-            'on Tower: make tower-secrets, and start it with them (docs/tower.md)',
+            'on the server: make tower-secrets, and start it with them (docs/tower.md)',
         )
 
 
 def _no_answer(service: TowerService, reason: object) -> Result:
-    remedy = 'on Tower: docker compose logs --tail 50 ; docker compose restart ; df -h'
+    remedy = 'on the server: docker compose logs --tail 50 ; docker compose restart ; df -h'
     if isinstance(reason, TimeoutError):
         seen = f'{service.url} accepts the connection but does not answer within {ANSWER_S:g} s'
         return error('s3.answer', seen, 'the server hangs: a full or dead disk, or storage that it cannot reach', remedy)
@@ -147,14 +147,14 @@ def _clock(date: str) -> Iterator[Result]:
     except (TypeError, ValueError):
         return
     which = 'ahead of' if skew_s > 0 else 'behind'
-    seen = f'the clock of this machine is {abs(skew_s):.0f} s {which} that of Tower'
+    seen = f'the clock of this machine is {abs(skew_s):.0f} s {which} that of the server'
     remedy = 'on both machines: timedatectl ; sudo timedatectl set-ntp true  (docs/thor.md, Wrong clock)'
     if abs(skew_s) >= REFUSED_SKEW_S - 60.0:
         yield error('s3.clock', seen, 'beyond 15 minutes the server rejects every signature', remedy, skew_s=round(skew_s, 1))
     elif abs(skew_s) > SKEW_S:
-        yield warning('s3.clock', seen, 'times of robot and Tower cannot be compared', remedy, skew_s=round(skew_s, 1))
+        yield warning('s3.clock', seen, 'times of robot and server cannot be compared', remedy, skew_s=round(skew_s, 1))
     else:
-        yield ok('s3.clock', 'the clocks of this machine and of Tower agree', skew_s=round(skew_s, 1))
+        yield ok('s3.clock', 'the clocks of this machine and of the server agree', skew_s=round(skew_s, 1))
 
 
 def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
@@ -190,7 +190,7 @@ def _buckets(requests: S3Requests) -> Iterator[Result]:
     try:
         there = requests.buckets()
     except AccessDenied as problem:
-        yield from_error('s3.buckets', problem, "these are not Tower's own keys; --role robot checks a robot's keys")
+        yield from_error('s3.buckets', problem, "these are not the server's own keys; --role robot checks a robot's keys")
         return
     for name in TOWER_BUCKETS:
         if name not in there:
@@ -224,7 +224,7 @@ def _delete(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
         requests.delete(bucket, name)
         gone = requests.head(bucket, name) is None
     except AccessDenied as problem:
-        yield from_error('s3.delete', problem, "these are not Tower's own keys")
+        yield from_error('s3.delete', problem, "these are not the server's own keys")
         return
     if gone:
         yield ok('s3.delete', 'an object can be deleted')
@@ -245,7 +245,7 @@ def race_creates(requests: S3Requests, bucket: str, robot: str) -> Iterator[Resu
         for name in names:
             requests.delete(bucket, name)
     except AccessDenied as problem:
-        yield from_error('s3.race', problem, "these are not Tower's own keys")
+        yield from_error('s3.race', problem, "these are not the server's own keys")
         return
     if winners == [1] * RACES:
         yield ok('s3.race', f'of {RACERS} concurrent creators of an object one succeeds')
@@ -290,7 +290,7 @@ def _read(requests: S3Requests, context: Context) -> Iterator[Result]:
 
 def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
     """On Spark and Tower: check that one of several concurrent replacements of a mailbox succeeds, and none if there is none."""
-    check, remedy = 's3.mailbox', 'on Tower: run tower/make_secrets.py and tower/prepare.py again, and restart the server'
+    check, remedy = 's3.mailbox', 'on the server: run tower/make_secrets.py and tower/prepare.py again, and restart the server'
     try:
         item = s3_put.probe(MAILBOX_BUCKET, inbox_key(RACED))
         requests.put(item, s3_put.BODY, conditional=True)
@@ -300,7 +300,7 @@ def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
         yield info(
             check,
             'these keys may not request objects that a robot keeps',
-            'this Tower was prepared by an earlier version',
+            'this server was prepared by an earlier version',
             remedy,
         )
         return

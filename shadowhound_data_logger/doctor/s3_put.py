@@ -95,7 +95,7 @@ def write(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
             's3.read',
             f'{bucket}/{item.key} reads back differently',
             'another client writes there, or the server damages content',
-            'on Tower: check its disks and its log',
+            'on the server: check its disks and its log',
         )
         return
     yield ok('s3.write', f'{bucket}: an object was written and read back')
@@ -107,7 +107,7 @@ def write(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
         's3.condition',
         f'{bucket}: the server {how} If-None-Match',
         'it would overwrite; each put must look first, which is slower, and concurrent writers are not detected',
-        'update the S3 server on Tower: SeaweedFS, or MinIO of 2024 or later',
+        'update the S3 server: SeaweedFS, or MinIO of 2024 or later',
     )
 
 
@@ -129,12 +129,12 @@ def promises(requests: S3Requests, bucket: str, robot: str, latency_s: float) ->
             's3.checksum',
             'the server accepted an object with a wrong CRC32',
             'it does not verify x-amz-checksum-sha256: content damaged in transit would be confirmed',
-            'update the S3 server on Tower',
+            'update the S3 server',
         )
     mbps = 8e-6 * size / max(took_s - latency_s, took_s / 2)
     yield measured(
         's3.throughput',
-        f'{mbps:,.1f} Mbit/s to Tower ({size >> 10} KiB in {took_s:.2f} s)',
+        f'{mbps:,.1f} Mbit/s to the server ({size >> 10} KiB in {took_s:.2f} s)',
         'below the data rate of the default settings: the backlog grows',
         'iw dev wlan0 link ; log less: camera.rate_hz, lidar.rate_hz, camera.quality in the parameter file',
         is_fine=mbps >= SLOW_MBPS,

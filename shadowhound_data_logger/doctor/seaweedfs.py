@@ -62,7 +62,7 @@ def check(context: Context) -> Iterator[Result]:
             f'SeaweedFS serves every client at {where}',
             'it was started without keys and a certificate for its internal servers: every client that can reach one '
             'can become an administrator, and read or delete objects',
-            'on Tower: make tower-secrets, and start the servers again (docs/tower.md)',
+            'on the server: make tower-secrets, and start the servers again (docs/tower.md)',
             ports=[probe.port for _, probe in found],
         )
     else:

@@ -52,7 +52,7 @@ def _known(context: Context) -> Iterator[Result]:
             'secrets.default',
             'AWS_SECRET_ACCESS_KEY is a well-known default',
             'it is the default of a server',
-            'on Tower: make tower-secrets, and copy the new keys to Thor and Spark',
+            'on the server: make tower-secrets, and copy the new keys to robots and workstations',
         )
 
 

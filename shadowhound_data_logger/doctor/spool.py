@@ -177,11 +177,11 @@ def _backlog(usage: SpoolStatus, context: Context, *, runs: bool) -> Result:
     if not runs:
         return warning('spool.backlog', seen, 'nothing is delivered while the node is not running', START, **figures)
     if drain_s is None:
-        return warning('spool.backlog', seen, 'Tower is unreachable, or accepts nothing', STORE, **figures)
+        return warning('spool.backlog', seen, 'the server is unreachable, or accepts nothing', STORE, **figures)
     return warning(
         'spool.backlog',
         seen,
-        'Tower was unreachable for long, or more is logged than the network can carry',
+        'the server was unreachable for long, or more is logged than the network can carry',
         'move the robot to a better network; log less: camera.rate_hz, lidar.rate_hz; upload.max_mbps 0',
         **figures,
     )

@@ -58,7 +58,7 @@ MAX_POINTS: Final = 1000
 """MLflow's limit for a batch."""
 _Batch = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
 """Points, params and tags."""
-S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server of Tower, such as http://TOWER_IP:9000'
+S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server, such as http://TOWER_IP:9000'
 _USER: Final = re.compile(r'//[^/\s]*@')
 
 
@@ -226,7 +226,7 @@ class MlflowTracking:
         except MlflowException as error:
             if error.error_code == 'PERMISSION_DENIED':
                 text = f'there is no experiment {self._experiment} in {self.where}, and this user may not create it'
-                remedy = 'on Tower: make tower-secrets TOWER_ARGS="--robot NAME", and start MLflow again'
+                remedy = 'on the server: make tower-secrets TOWER_ARGS="--robot NAME", and start MLflow again'
                 raise TrackingUnavailable(text, remedy=remedy, code=error.error_code) from error
             if error.error_code != 'RESOURCE_ALREADY_EXISTS':
                 raise
@@ -342,4 +342,4 @@ def remedy_for(code: str) -> str:
         )
     if code == 'ENDPOINT_NOT_FOUND':
         return 'check that MLFLOW_TRACKING_URI is the address of an MLflow server'
-    return 'check MLFLOW_TRACKING_URI, and that Tower is on; the request is retried automatically'
+    return 'check MLFLOW_TRACKING_URI, and that the server is on; the request is retried automatically'

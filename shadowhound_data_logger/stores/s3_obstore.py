@@ -300,7 +300,7 @@ def _provider(settings: StoreSettings) -> Any:
 
     if not has_keys(settings):
         endpoint = _without_password(settings.endpoint_url or '')
-        text = f'there are no credentials for Tower at {endpoint}'
+        text = f'there are no credentials for the S3 server at {endpoint}'
         remedy = 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them'
         raise CredentialsRejected(text, remedy=remedy, endpoint=endpoint)
     return Boto3CredentialProvider()

@@ -239,7 +239,8 @@ def test_an_unreachable_store_is_reported(home: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'SECRET')
     answer = run('drain', '--idle-timeout', '1')
     assert answer.return_value == 1
-    assert '3 objects still waiting: Tower at http://127.0.0.1:9 refused the connection' in ' '.join(answer.stdout.split())
+    text = ' '.join(answer.stdout.split())
+    assert '3 objects still waiting: the S3 server at http://127.0.0.1:9 refused the connection' in text
     assert 'SECRET' not in answer.output
     assert states(home)['a.jpg'] == 'pending'
 

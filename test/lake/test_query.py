@@ -343,7 +343,7 @@ def test_wrong_credentials_are_reported_without_showing_them(seaweed: Tower) -> 
 
 @pytest.mark.parametrize(
     ('keys', 'error', 'says'),
-    [({}, CredentialsRejected, 'there are no credentials for Tower'),
+    [({}, CredentialsRejected, 'there are no credentials for the S3 server'),
      ({'access_key_id': 'k'}, SettingError, 'AWS_SECRET_ACCESS_KEY'),
      ({'secret_access_key': 's'}, SettingError, 'AWS_ACCESS_KEY_ID')],
 )  # fmt: skip

@@ -74,7 +74,7 @@ ANSWERS: tuple[tuple[int, str, type[StoreError]], ...] = (
 FAILURES: tuple[tuple[Exception, type[StoreError], str], ...] = (
     (boto.EndpointConnectionError(endpoint_url=URL, error=ConnectionRefusedError(111, 'no')), StoreUnavailable, 'refused'),
     (boto.EndpointConnectionError(endpoint_url=URL, error=OSError(113, 'No route to host')), StoreUnavailable, 'No route'),
-    (boto.ConnectTimeoutError(endpoint_url=URL), StoreUnavailable, 'no connection to Tower at http://192.168.1.5:9000 within'),
+    (boto.ConnectTimeoutError(endpoint_url=URL), StoreUnavailable, 'no connection to the S3 server at http://192.168.1.5:9000'),
     (boto.ReadTimeoutError(endpoint_url=URL), StoreUnavailable, 'no answer within 30 s'),
     (boto.ConnectionClosedError(endpoint_url=URL), StoreUnavailable, 'closed the connection'),
     (boto.IncompleteReadError(actual_bytes=1, expected_bytes=2), StoreUnavailable, 'closed the connection'),

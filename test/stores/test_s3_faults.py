@@ -52,7 +52,7 @@ def test_no_answer(fault: str, opened: Callable[..., S3Store], spool: Spool) -> 
 def test_an_unknown_name(opened: Callable[..., S3Store], spool: Spool) -> None:
     """A host name that does not resolve is not an outage of the server."""
     said = error_of(StoreUnavailable, opened('http://tower.invalid:9000', IMPATIENT).probe)
-    assert 'the name of Tower at http://tower.invalid:9000 cannot be resolved' in said
+    assert 'the name of the S3 server at http://tower.invalid:9000 cannot be resolved' in said
 
 
 def test_every_wait_ends(opened: Callable[..., S3Store], spool: Spool) -> None:
@@ -68,7 +68,7 @@ ANSWERS: dict[str, tuple[int, bytes, type[StoreError], str]] = {
     'slow down': (503, fake_s3.error('SlowDown'), StoreUnavailable, 'is overloaded (503 SlowDown)'),
     'internal error': (500, fake_s3.error('InternalError'), StoreUnavailable, 'a server error (500 InternalError)'),
     'bad gateway': (502, b'<html>nginx</html>', StoreUnavailable, 'a server error (502'),
-    'disk full': (507, fake_s3.error('XMinioStorageFull'), StoreUnavailable, 'the disk of Tower'),
+    'disk full': (507, fake_s3.error('XMinioStorageFull'), StoreUnavailable, 'the disk of the S3 server'),
     'clock': (403, fake_s3.error('RequestTimeTooSkewed'), StoreUnavailable, 'set the clock'),
     'another web server': (404, b'<html>Not found</html>', StoreUnavailable, 'does not answer like an S3 server'),
     'a login page': (200, b'<html>Welcome to our WiFi</html>', StoreUnavailable, 'does not answer like an S3 server'),
