@@ -26,7 +26,7 @@ from datasets import run
 from obstore.store import S3Store
 from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows import catalog
 
 HERE: Final = Path(__file__).resolve().parent
 FPS: Final = 30
@@ -67,7 +67,7 @@ def measure(options: argparse.Namespace) -> Report:
     with Tower(folder / 'tower') as tower:
         settings = tower.store_settings()
         make_bucket(tower)
-        bare = S3Store(schema.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
+        bare = S3Store(catalog.BUCKET, endpoint=settings.endpoint_url, access_key_id=settings.access_key_id,
                        region=settings.region, secret_access_key=settings.secret_access_key, virtual_hosted_style_request=False,
                        client_options={'allow_http': True})  # fmt: skip
         size = fill(bare, bodies)

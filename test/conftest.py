@@ -38,11 +38,11 @@ ONE_ROBOT_AT_A_TIME = (
     'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',
 )  # fmt: skip
 """Files with robots at full rate, of which nothing may be missed. They come first, after one another, and others make way."""
-ONE_SENDER = ('test/missions/test_guide.py', 'test/missions/test_mlflow.py')
+ONE_SENDER = ('test/e2e/test_guide.py', 'test/missions/test_tracking.py')
 """Files whose missions one process sends, which has loaded MLflow."""
 ONE_TEAM = (
-    'test/e2e/test_closed_loop.py', 'test/policies/test_attacks.py', 'test/policies/test_fleet.py',
-    'test/policies/test_transfer.py', 'test/policies/test_way.py',
+    'test/e2e/test_closed_loop.py', 'test/policies/test_trust.py', 'test/e2e/test_policies.py',
+    'test/policies/test_sync.py', 'test/e2e/test_policies.py',
 )  # fmt: skip
 """Files that sign policies on a shared Tower, which serves one team at a time."""
 WAITING = ('test/doctor/', 'test/e2e/', 'test/missions/', 'test/sim/', 'test/tower/')

@@ -92,7 +92,7 @@ def folders(path: Path) -> Iterator[str]:
             yield PLACES.get(inside.partition('.')[0], 'face')
 
 
-def test_every_folder_has_its_place() -> None:
+def test_every_folder_has_its_position() -> None:
     """The order names every folder, and none that is gone."""
     assert sorted(ORDER) == sorted(set(PLACES.values()))
 
@@ -106,19 +106,19 @@ def test_a_folder_imports_only_those_before_it(name: str) -> None:
 
 
 @pytest.mark.parametrize('package', sorted(ALLOWED))
-def test_who_imports_what(package: str) -> None:
+def test_imports_are_those_that_are_allowed(package: str) -> None:
     """ROS, S3, MLflow and Arrow are known to their own folders alone."""
     importers = {folder(path) for path in MODULES if any(name.partition('.')[0] == package for name in imports(path))}
     assert importers <= ALLOWED[package]
 
 
-def test_one_file_knows_mlflow() -> None:
+def test_one_file_imports_mlflow() -> None:
     """Of the missions, tracking.py alone imports it, and none of its importing happens where an agent logs."""
     ours = [path for path in MODULES if folder(path) == 'missions']
     assert [path.name for path in ours if any(name.startswith('mlflow') for name in imports(path))] == ['tracking.py']
 
 
-def test_one_file_of_the_stores_knows_obstore() -> None:
+def test_one_file_of_the_stores_imports_obstore() -> None:
     """It comes with the extra ``lake``: a robot has none."""
     ours = [path for path in MODULES if folder(path) == 'stores']
     assert [path.name for path in ours if any(name.startswith('obstore') for name in imports(path))] == ['s3_obstore.py']
@@ -140,7 +140,7 @@ def test_only_the_tables_of_the_spools_index_send_sql_to_it() -> None:
     assert [name for name in own if 'FROM objects' in (ROOT / name).read_text(encoding='utf-8')] == []
 
 
-def test_the_live_page_knows_nothing_of_the_nodes_insides() -> None:
+def test_the_live_page_does_not_import_the_node() -> None:
     """It reads topics through ros/ and what is stored through spool/; one file of it knows ROS, and is loaded where ROS is."""
     ours = [path for path in MODULES if folder(path) == 'live']
     reads_the_past = {'past.py', 'history.py', 'kept.py', 'fleet.py'}  # in a process of their own
@@ -151,7 +151,7 @@ def test_the_live_page_knows_nothing_of_the_nodes_insides() -> None:
     assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['topics.py']
 
 
-def test_one_file_of_the_doctor_knows_ros() -> None:
+def test_one_file_of_the_doctor_imports_ros() -> None:
     """It is loaded in a process of its own, which may crash; the rest of the doctor works on machines without ROS."""
     ours = [path for path in MODULES if folder(path) == 'doctor']
     assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['ros_watch.py']
@@ -176,7 +176,7 @@ def test_metadata_keys_are_documented() -> None:
     assert [word for word in words.values() if f'`{word}`' not in page] == []
 
 
-def test_the_page_on_architecture_names_files_that_are_there() -> None:
+def test_the_page_on_architecture_names_existing_files() -> None:
     """Who looks for the place of a change there finds it."""
     page = (ROOT.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
     named = set(re.findall(r'`([\w/]+\.py)\b', page)) - {'bench/code.py', 'test/test_borders.py'}
@@ -185,7 +185,7 @@ def test_the_page_on_architecture_names_files_that_are_there() -> None:
     assert sorted(named - there) == []
 
 
-def test_the_glossary_names_what_is_there() -> None:
+def test_the_glossary_names_existing_terms() -> None:
     """Each of its terms is in the code or on another page, stands there once, and in order."""
     page = (ROOT.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
     terms = re.findall(r'^- \*\*(.+?)\*\*', page.partition('## Glossary')[2].partition('\n## ')[0], re.MULTILINE)

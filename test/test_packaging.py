@@ -86,7 +86,7 @@ def test_an_entry_point_leads_to_a_function(point: str) -> None:
     assert callable(getattr(importlib.import_module(module), function))
 
 
-def test_setup_py_asks_for_what_the_lock_is_made_from() -> None:
+def test_setup_py_and_the_lock_files_agree() -> None:
     """`pip install .` and the lock files start from the same requirements."""
     assert sorted(setup_arguments()['install_requires']) == sorted(requirements('runtime.in').values())
 
@@ -138,7 +138,7 @@ def test_every_import_is_a_dependency() -> None:
         ('kilted_wheels.txt', ['runtime.in', 'kilted.in', 'dev.in']),
     ],
 )
-def test_a_lock_file_holds_what_it_is_made_from(lock: str, sources: list[str]) -> None:
+def test_a_lock_file_has_its_requirements(lock: str, sources: list[str]) -> None:
     """No requirement was added without `make lock`, and each pin has a hash."""
     wanted = {package.split('[')[0] for source in sources for package in requirements(source)}
     assert not wanted - locked(lock)

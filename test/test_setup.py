@@ -75,7 +75,7 @@ def machine(tmp_path: Path) -> Machine:
     return Machine(tmp_path)
 
 
-def test_the_one_on_the_path(machine: Machine) -> None:
+def test_a_python_on_the_path_is_used(machine: Machine) -> None:
     """It goes before those of pyenv and uv."""
     for where, version in (('PATH', '3.12'), ('pyenv', '3.10'), ('uv', '3.11')):
         machine.python(where, version)
@@ -83,7 +83,7 @@ def test_the_one_on_the_path(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize('where', ['pyenv', 'uv'])
-def test_one_that_is_not_on_the_path(machine: Machine, where: str) -> None:
+def test_a_python_outside_the_path_is_found(machine: Machine, where: str) -> None:
     """Where the one on PATH is newer than the ROS wheels, and so are others."""
     machine.python('PATH', '3.13')
     machine.python(where, '3.14')
@@ -92,7 +92,7 @@ def test_one_that_is_not_on_the_path(machine: Machine, where: str) -> None:
     assert machine.taken() == str(serves)
 
 
-def test_one_that_makes_environments(machine: Machine) -> None:
+def test_only_a_python_that_makes_environments_is_used(machine: Machine) -> None:
     """A Python without venv, as Debian has it, gives way to one that has it."""
     machine.python('PATH', '3.11', makes_venvs=False)
     serves = machine.python('uv', '3.12')
@@ -107,7 +107,7 @@ def test_missing_programs_are_reported(machine: Machine) -> None:
     assert 'apt install python3-venv' in said
 
 
-def test_no_python_that_serves(machine: Machine) -> None:
+def test_without_a_suitable_python_the_remedy_is_named(machine: Machine) -> None:
     """One line says which to install, and how."""
     for where in ('PATH', 'pyenv', 'uv'):
         machine.python(where, '3.13')

@@ -22,9 +22,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from hostile.rounds import KINDS, Shop, watch_writes
-
 from torture._command import progress
+from torture._reader_rounds import KINDS, Shop, watch_writes
 
 LIMIT_BYTES: Final = 2 << 30
 HANG_S: Final = 60.0

@@ -4,7 +4,7 @@ If rclpy reports less about a message than its RMW knows (Humble: neither number
 publisher), messages are taken through librcl, after that was verified with messages of the node to itself.
 
 What it needs beyond rclpy's documented interface, from the sources of rclpy 8.0.0 (Rolling, ``ba72a017``) and rmw (``33118c9d``);
-``test/node/test_innards.py`` checks each on the installed rclpy:
+``test/ros/test_reader.py`` checks each on the installed rclpy:
 
 - ``Subscription.handle``, a context manager with ``take_message(type, raw)`` and ``pointer``: without it nothing is taken
 - keys of the information about a message: ``source_timestamp``, ``received_timestamp`` and, where the distribution has them,

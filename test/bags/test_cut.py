@@ -64,7 +64,7 @@ def source(origin: Path, wanted: Callable[[RecordedMessage], bool]) -> list[Reco
     (Choice(f'{T0 // 10**9 + 3}.5', '4', topics=('imu',)), 350, 400, {'/imu'}),
     (Choice('0', '2', regex='^/cam'), 0, 200, {'/camera/blob'}),
 ])  # fmt: skip
-def test_it_has_these_messages_and_no_others(
+def test_a_cut_has_the_messages_of_its_time_and_no_others(
     origin: Path, store: MemoryStore, tmp_path: Path, choice: Choice, first: int, last: int, topics: set[str]
 ) -> None:
     """Topic, both stamps, sequence number and bytes of each message are copied in order; the source is unchanged."""
@@ -77,7 +77,7 @@ def test_it_has_these_messages_and_no_others(
     assert list(messages_of([cut_folder(origin, tmp_path / 'again', choice).folder / 'again_0.mcap'])) == wanted
 
 
-def test_several_times_are_one_bag(origin: Path, store: MemoryStore, tmp_path: Path) -> None:
+def test_several_times_become_one_bag(origin: Path, store: MemoryStore, tmp_path: Path) -> None:
     """Messages between the requested start and end are copied in order."""
     spans = (
         (T0 - STEP_NS, T0 + 3 * STEP_NS),
@@ -99,7 +99,7 @@ def test_little_more_is_read_than_its_chunks(store: MemoryStore, tmp_path: Path)
     assert found.read_requests <= 3
 
 
-def test_also_from_a_real_server(seaweed: Tower, origin: Path, tmp_path: Path) -> None:
+def test_a_cut_from_an_s3_server_is_the_same(seaweed: Tower, origin: Path, tmp_path: Path) -> None:
     """Ranged reads over S3 give the same piece."""
     s3 = open_store(seaweed.store_settings(), QUICK)
     try:
@@ -114,7 +114,9 @@ def test_also_from_a_real_server(seaweed: Tower, origin: Path, tmp_path: Path) -
 
 @pytest.mark.parametrize(('plugin', 'mode'), KINDS, ids=lambda value: value.name)
 @pytest.mark.parametrize('is_remote', [False, True], ids=['folder', 'store'])
-def test_bags_of_others(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode, is_remote: bool) -> None:
+def test_a_cut_of_any_rosbag2_bag_is_an_mcap_bag(
+    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode, is_remote: bool
+) -> None:
     """Whatever rosbag2 writes becomes a plain MCAP bag of the same messages."""
     folder = tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'theirs'
     write_rosbags(folder, plugin, mode)
@@ -213,7 +215,7 @@ def test_an_empty_cut_leaves_no_files(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_others_may_read_a_piece_as_they_may_any_file(origin: Path, tmp_path: Path) -> None:
+def test_a_piece_has_the_usual_file_permissions(origin: Path, tmp_path: Path) -> None:
     """Its slice is not a private file of a spool: the umask alone decides."""
     before = os.umask(0o027)
     try:

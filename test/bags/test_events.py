@@ -1,22 +1,29 @@
-"""An event's bag has the seconds before its trigger and after it, each message once, and the ledger says what it lacks."""
+"""An event's bag has the seconds before its trigger and after it, each message once, and the ledger says what it lacks.
+
+What a disk that hangs or is full, a folder that cannot be made, and a kill cost an event: as little as can be, and counted.
+"""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from bags.eventing import buffer, hear_each_second, in_bag, only_bag
-from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, mission
+from bags.eventing import Buffer, buffer, hear_each_second, in_bag, only_bag, until
+from bags.recording import ROBOT, STRING, WAIT_S, journaled, manifest, messages, missing, mission
+from bags.test_recorder import kill
+from clocks import Clocks
 from spool.making import NOON_NS
 
 from shadowhound_data_logger.bags.queue import MessageBatch
+from shadowhound_data_logger.bags.recording import Recording
 from shadowhound_data_logger.core.model import DataObject, RecordingRows
 from shadowhound_data_logger.core.options import EventSettings
 from shadowhound_data_logger.core.status import EventStatus
 
 
-def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:
+def test_an_event_has_the_seconds_before_and_after_its_trigger(tmp_path: Path) -> None:
     """No more and no less; the manifest says why, whole and under the event's name."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(20))
@@ -52,7 +59,7 @@ def test_the_manifest_names_the_requester(tmp_path: Path) -> None:
         assert first['at_ns'] == NOON_NS
 
 
-def test_what_was_on_its_way_for_a_while_counts_from_when_it_happened(tmp_path: Path) -> None:
+def test_a_delayed_trigger_counts_from_when_it_happened(tmp_path: Path) -> None:
     """An agent's log_event is noticed late: the event's seconds are counted from the call."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(20))
@@ -137,7 +144,7 @@ def test_a_gap_within_an_event_is_missed(tmp_path: Path) -> None:
         assert it.rows()['/echo']['missed'] == 0
 
 
-def test_repeats_are_in_it_once(tmp_path: Path) -> None:
+def test_repeats_are_in_an_event_once(tmp_path: Path) -> None:
     """What two subscriptions brought is one message."""
     with buffer(tmp_path) as it:
         it.hear(range(5))
@@ -148,7 +155,7 @@ def test_repeats_are_in_it_once(tmp_path: Path) -> None:
         assert in_bag(it, only_bag(it)) == list(range(8))
 
 
-def test_what_is_latched_is_in_each_event(tmp_path: Path) -> None:
+def test_latched_messages_are_in_each_event(tmp_path: Path) -> None:
     """Though it came long before; each time it counts as received, and nothing of it is missed."""
     with buffer(tmp_path) as it:
         it.ring.put(MessageBatch('/tf_static', STRING, '', messages(range(40, 42)), 1), None, it.now_s[0])
@@ -163,7 +170,7 @@ def test_what_is_latched_is_in_each_event(tmp_path: Path) -> None:
         assert (row['received'], row['stored'], row['missed'], row['published']) == (2, 2, 0, 2)
 
 
-def test_it_ships_first_and_is_never_evicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_event_is_uploaded_first_and_never_evicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its slices go before what the sensors keep, and stay when the disk is full."""
     with buffer(tmp_path) as it:
         given: list[DataObject] = []
@@ -196,7 +203,7 @@ def test_the_manifest_names_the_mission(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['../../etc', 'über den Berg', '', 'x' * 300])
-def test_a_name_that_cannot_be_in_a_key_is_made_one_that_can(tmp_path: Path, name: str) -> None:
+def test_a_name_that_cannot_be_in_a_key_is_replaced(tmp_path: Path, name: str) -> None:
     """An agent may call its event anything; the manifest has the name that it used."""
     with buffer(tmp_path) as it:
         it.hear(range(2))
@@ -209,7 +216,7 @@ def test_a_name_that_cannot_be_in_a_key_is_made_one_that_can(tmp_path: Path, nam
         assert manifest(it.objects(), bag)['event']['triggers'][0]['name'] == (name or '?')
 
 
-def test_a_ring_without_anything_makes_no_bag(tmp_path: Path) -> None:
+def test_an_empty_ring_makes_no_bag(tmp_path: Path) -> None:
     """A trigger before the first message leaves nothing behind when nothing comes."""
     with buffer(tmp_path) as it:
         it.events.trigger('early', 'service')
@@ -230,7 +237,7 @@ def test_a_close_ends_the_event(tmp_path: Path) -> None:
         assert it.events.trigger('late', 'service') == (False, 'no event can start: the node is shutting down')
 
 
-def test_without_topics_there_is_nothing(tmp_path: Path) -> None:
+def test_without_topics_no_event_is_recorded(tmp_path: Path) -> None:
     """There is no thread and no ring, and a trigger returns the reason."""
     with buffer(tmp_path, topics=('',)) as it:
         assert list(it.events.workers) == []
@@ -250,3 +257,136 @@ def test_changed_settings_apply_immediately(tmp_path: Path) -> None:
         it.written()
         assert in_bag(it, only_bag(it)) == list(range(8, 12))
         assert it.events.status().max_bytes == 2 << 20
+
+
+class Disk:
+    """Takes nothing while it hangs."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.works = threading.Event()
+        self.works.set()
+        write = Recording.write
+
+        def waiting(recording: Recording, batch: MessageBatch) -> None:
+            assert self.works.wait(WAIT_S)
+            write(recording, batch)
+
+        monkeypatch.setattr(Recording, 'write', waiting)
+
+
+def test_messages_evicted_from_the_ring_before_they_were_written_are_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hung disk costs the oldest claimed messages, which are counted; the ring does not exceed its limit."""
+    disk = Disk(monkeypatch)
+    with buffer(tmp_path, max_bytes=1 << 20) as it:
+        disk.works.clear()
+        it.hear(range(5), size=50_000)
+        it.events.trigger('slow', 'service')
+        it.taken()
+        for number in range(5, 35):
+            it.hear(range(number, number + 1), size=50_000)
+        assert it.ring.bytes <= 1 << 20
+        disk.works.set()
+        it.pass_s(5.0)
+        it.written()
+        row = it.rows()['/talk']
+        assert (row['received'], row['stored'], row['dropped'], row['missed']) == (35, 25, {'ring_full': 10}, 0)
+        assert in_bag(it, only_bag(it)) == [*range(5), *range(15, 35)]
+        said = manifest(it.objects(), only_bag(it))
+        assert missing(said) == journaled(it.spool.root, 'events') == {('/talk', 'ring_full'): 10}
+
+
+def test_written_messages_leave_the_ring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no second copy of the ring: what is on its way to the disk is one piece, and the rest still in the ring."""
+    disk = Disk(monkeypatch)
+    with buffer(tmp_path, max_bytes=16 << 20) as it:
+        for number in range(15):
+            it.hear(range(number, number + 1), size=1 << 20)
+        before = it.ring.bytes
+        disk.works.clear()
+        it.events.trigger('large', 'service')
+        until(lambda: it.ring.bytes < before, 'it begins')
+        assert before - it.ring.bytes < 1.1 * (1 << 20)
+        disk.works.set()
+        it.pass_s(5.0)
+        it.written()
+        assert len(in_bag(it, only_bag(it))) == 15
+
+
+def test_a_full_disk_loses_only_the_event(tmp_path: Path) -> None:
+    """What it takes nothing of is dropped and counted, and the next event is whole."""
+    with buffer(tmp_path) as it:
+        it.room[0] = False
+        it.hear(range(5))
+        it.events.trigger('lost', 'service')
+        it.pass_s(5.0)
+        it.written()
+        assert it.rows()['/talk']['dropped'] == {'no_room': 5}
+        it.room[0] = True
+        it.hear(range(5, 10))
+        it.events.trigger('kept', 'service')
+        it.pass_s(5.0)
+        it.written(2)
+        kept, lost = it.bags()
+        assert in_bag(it, kept) == list(range(5, 10))
+        assert missing(manifest(it.objects(), lost)) == journaled(it.spool.root, 'events') == {('/talk', 'no_room'): 5}
+
+
+def test_a_folder_that_cannot_be_created_costs_only_the_event(tmp_path: Path) -> None:
+    """It is tried again until the event is over, then its messages are dropped; nothing stays claimed."""
+    with buffer(tmp_path) as it:
+        it.root.parent.mkdir(parents=True)
+        it.root.write_text('in the way')
+        it.hear(range(5))
+        it.events.trigger('lost', 'service')
+        until(lambda: it.events.status().refused, 'it is refused')
+        it.pass_s(5.0)
+        until(lambda: not it.events.status().bag, 'the event is over')
+        assert it.rows()['/talk']['dropped'] == {'unwritable': 5}
+        assert not it.ring.claimed
+        it.root.unlink()
+
+
+def killed(home: Path, it: Buffer) -> Path:
+    """What the next start would find had the node been killed now, with the accounts that were committed last."""
+    it.rows()
+    return kill(home)
+
+
+def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What reached the disk is in the event's bag, which says that the rest is missing; the ledger closes."""
+    monkeypatch.setattr('shadowhound_data_logger.bags.events.SYNC_S', 3600.0)  # the second trigger syncs
+    home = tmp_path / 'home'
+    with buffer(home) as it:
+        it.hear(range(10), size=2000)
+        it.events.trigger('fall', 'service', 'leg 2')
+        it.taken()
+        it.pass_s(1.0)
+        it.events.trigger('low_battery', 'condition')
+        until(lambda: any(b'low_battery' in path.read_bytes() for path in it.root.glob('*/*.open')), 'the slice knows of it')
+        until(lambda: any(path.stat().st_size > 20_000 for path in it.root.glob('*/*.open')), 'it is synced')
+        it.hear(range(10, 15), size=2000)
+        it.taken()
+        assert it.rows()['/talk']['open'] == 15
+        left = killed(home, it)
+    clock = Clocks()
+    clock.set()
+    clock.wait(60.0)
+    with buffer(left, clock) as it:
+        bag = only_bag(it)
+        assert in_bag(it, bag) == list(range(10))
+        said = manifest(it.objects(), bag)
+        assert said['state'] == 'recovered'
+        assert said['missing'][-1]['what'].startswith('messages in memory')
+        assert [one['name'] for one in said['event']['triggers']] == ['fall', 'low_battery']
+        row = it.rows()['/talk']
+        assert (row['received'], row['stored'], row['open'], row['dropped']) == (15, 10, 0, {'restart': 5})
+        assert said['missing'][-1]['messages'] is None  # how many is known of all its topics, not of the bag
+        assert journaled(it.spool.root, 'events') == {('/talk', 'restart'): 5}
+        assert not list(it.root.iterdir())
+        it.hear(range(20, 25))
+        it.events.trigger('after', 'service')
+        it.pass_s(5.0)
+        it.written()
+        assert it.rows()['/talk']['missed'] == 0

@@ -58,7 +58,7 @@ def files(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
-def test_it_is_the_very_bag(store: Counting, tmp_path: Path) -> None:
+def test_a_fetched_bag_is_the_uploaded_bag(store: Counting, tmp_path: Path) -> None:
     """Every file is what the robot wrote, there are no others, and the reported progress adds up to all bytes."""
 
     class Sum(ProgressListener):
@@ -169,7 +169,7 @@ def test_a_foreign_bag_is_fetched_unchanged(tmp_path: Path) -> None:
     assert len(by_rosbags(found.folder)) == 300
 
 
-def test_two_at_a_time_do_not_mix(store: Counting, tmp_path: Path) -> None:
+def test_two_concurrent_fetches_do_not_mix(store: Counting, tmp_path: Path) -> None:
     """A second process in the same folder gets an error that names the first."""
     folder = tmp_path / 'here' / NAME
     folder.mkdir(parents=True)

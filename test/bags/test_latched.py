@@ -154,7 +154,7 @@ def test_a_slice_of_only_repeats_is_not_written(tmp_path: Path) -> None:
         assert len(slices(it, bag)) == 1
 
 
-def test_another_bag_knows_nothing_of_the_one_before(tmp_path: Path) -> None:
+def test_a_bag_does_not_depend_on_the_previous_one(tmp_path: Path) -> None:
     """Its publishers are asked again (``Consumer.begin``): what it begins with is received, and counted."""
     with desk(tmp_path, record='always') as it:
         it.hear(range(1, 2), STATIC, latched=1)
@@ -165,7 +165,7 @@ def test_another_bag_knows_nothing_of_the_one_before(tmp_path: Path) -> None:
         assert repeats(slices(it, bag)[0]) == []
 
 
-def test_what_is_latched_in_a_pause_is_in_the_slices_after_it(tmp_path: Path) -> None:
+def test_messages_latched_during_a_pause_are_in_later_slices(tmp_path: Path) -> None:
     """Not recorded, and counted as paused, but no slice begins with a map that was replaced."""
     with desk(tmp_path) as it:
         bag = start(it.recorder)
@@ -180,7 +180,7 @@ def test_what_is_latched_in_a_pause_is_in_the_slices_after_it(tmp_path: Path) ->
         assert it.row(STATIC)['dropped'] == {}
 
 
-def test_what_is_latched_while_the_disk_is_full_is_in_the_slices_after_it(tmp_path: Path) -> None:
+def test_messages_latched_while_the_disk_is_full_are_in_later_slices(tmp_path: Path) -> None:
     """It was dropped, and is counted so; the slice after it begins with it."""
     with desk(tmp_path) as it:
         bag = start(it.recorder)
@@ -221,7 +221,7 @@ def of(publisher: str | None, number: int, topic: str = STATIC, size: int = 0, p
     return MessageBatch(topic, STRING, '', [message._replace(publisher=publisher)], publishers)
 
 
-def test_one_message_per_publisher() -> None:
+def test_one_latched_message_is_kept_per_publisher() -> None:
     """The newest, in the order of arrival; without publishers' names as many as there are; the same content counts once."""
     latched = Latched(1 << 20)
     for one in (of('p', 1), of('q', 2), of('p', 3), of('r', 3)):

@@ -33,12 +33,12 @@ WHOLE = Manifest(
 
 
 @pytest.mark.parametrize('manifest', [WHOLE, replace(WHOLE, mission=None, state='complete', missing=(), topics=(), slices=())])
-def test_read_as_written(manifest: Manifest) -> None:
+def test_a_manifest_is_read_as_it_was_written(manifest: Manifest) -> None:
     """Every field survives, null included."""
     assert Manifest.from_json(manifest.to_json()) == manifest
 
 
-def test_the_fields_that_others_read() -> None:
+def test_the_fields_that_other_programs_read_are_unchanged() -> None:
     """Names and places are a contract with every reader of the store."""
     found = json.loads(WHOLE.to_json())
     assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices', 'event',
@@ -52,7 +52,7 @@ def test_the_fields_that_others_read() -> None:
     }  # fmt: skip
 
 
-def test_what_made_an_event_comes_back() -> None:
+def test_the_cause_of_an_event_round_trips() -> None:
     """Each trigger has its time; a manifest without an event has none, and damage is reported with its field."""
     event = EventOf(
         'fall', 30.0, 12.5, 10.0,
@@ -73,7 +73,7 @@ def test_what_made_an_event_comes_back() -> None:
             Manifest.from_json(json.dumps(found).encode())
 
 
-def test_made_of_slices(tmp_path: Path) -> None:
+def test_a_manifest_is_made_from_its_slices(tmp_path: Path) -> None:
     """An entry and the topics are those that the slice writer returned."""
     one, _ = closed(tmp_path / 'bag_0.mcap', 10)
     two, _ = closed(tmp_path / 'bag_1.mcap', 4)
@@ -94,7 +94,7 @@ def test_made_of_slices(tmp_path: Path) -> None:
     ('slices[0].sha256', 'AB' * 32), ('slices[0].counts', []), ('slices[0].counts./imu', '5'), ('mission.type', None),
     ('missing[0].messages', -3),
 ])  # fmt: skip
-def test_what_is_wrong_is_named(place: str, value: object) -> None:
+def test_an_invalid_field_is_named(place: str, value: object) -> None:
     """One field that is not as it must be refuses the whole, and the error says which."""
     found = json.loads(WHOLE.to_json())
     inner: Any = found
@@ -117,7 +117,7 @@ def test_a_newer_manifest_may_have_more_fields() -> None:
 @given(st.binary(max_size=50) | st.recursive(
     st.none() | st.integers() | st.text(), lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=5,
 ).map(lambda value: json.dumps(value).encode()))  # fmt: skip
-def test_anything_else_is_refused(content: bytes) -> None:
+def test_any_other_document_is_refused(content: bytes) -> None:
     """Whatever is not a manifest is BagDamaged, never another error."""
     with pytest.raises(BagDamaged):
         Manifest.from_json(content)

@@ -11,7 +11,7 @@ NOON_NS = 1_760_788_800 * 10**9
 BOOT = '3e2c1f6a-8a4e-4d0e-9d0a-0f6a5b7c9d11'
 
 
-def test_names() -> None:
+def test_names_are_sorted_by_their_numbers() -> None:
     """They say what and when, in UTC, and differ; a slice's number is found again."""
     assert bag_name('', NOON_NS, lambda _: False) == 'recording_20251018_120000'
     assert bag_name('../../etc', NOON_NS, lambda _: False) == 'etc_20251018_120000'

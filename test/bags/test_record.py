@@ -54,7 +54,7 @@ def rosbags_of(home: Path) -> Path:
 
 
 @pytest.mark.long('starts more processes')
-def test_the_guides_function(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_function_of_the_guide_records_and_uploads(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """It returns when the store has the bag, with every topic that was published: the robot is not a Unitree."""
     found = record_and_upload_rosbag('patrol', 2)
     assert (found.delivered, found.dropped) == (True, 0)
@@ -69,7 +69,7 @@ def test_the_guides_function(home: Path, capfd: pytest.CaptureFixture[str]) -> N
 
 
 @long
-def test_other_topics_and_nothing(home: Path) -> None:
+def test_only_the_named_topics_are_recorded(home: Path) -> None:
     """A named topic alone; where nothing comes an error says so, and no bag is left."""
     found = record('words', 1.0, topics=['/text'])
     assert list(found.topics) == ['/text']
@@ -79,7 +79,7 @@ def test_other_topics_and_nothing(home: Path) -> None:
 
 
 @long
-def test_the_next_recorder_uploads_the_bag_of_a_killed_one(home: Path) -> None:
+def test_a_later_recorder_completes_and_uploads_the_bag_of_a_killed_one(home: Path) -> None:
     """Kill -9 while it records: the next recording makes it whole and says what may be missing."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
     child = subprocess.Popen([sys.executable, '-m', program, '--robot=thor', '--duration=60', '--topic=/odom', 'cut_off'])
@@ -98,7 +98,7 @@ def test_the_next_recorder_uploads_the_bag_of_a_killed_one(home: Path) -> None:
 
 
 @long
-def test_the_index_is_damaged_during_a_recording(home: Path) -> None:
+def test_a_recording_survives_a_damaged_index(home: Path) -> None:
     """The bag is completed and another one follows; both are in the store, and the call returns the last one."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
     command = [sys.executable, '-m', program, '--robot=thor', '--duration=60', '--topic=/odom', 'patrol']

@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.core.model import Outcome, State
 
 
-def test_a_bag_from_start_to_stop(tmp_path: Path) -> None:
+def test_a_bag_is_recorded_from_start_to_stop(tmp_path: Path) -> None:
     """Its slices, metadata and manifest are in the spool under the bag's name, its folder is gone, the accounts are closed."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
@@ -56,7 +56,7 @@ def test_both_stamps_and_the_number_are_kept(tmp_path: Path) -> None:
         assert schema.name == STRING
 
 
-def test_messages_without_a_number_are_numbered_by_their_place_in_the_bag(tmp_path: Path) -> None:
+def test_messages_without_a_number_get_their_position_in_the_bag(tmp_path: Path) -> None:
     """From 1 for each topic, whatever of them came at once and in whatever slice they are: no sequence repeats."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
@@ -74,7 +74,7 @@ def test_messages_without_a_number_are_numbered_by_their_place_in_the_bag(tmp_pa
         assert found == {'/talk': list(range(1, 11)), '/other': list(range(1, 8))}
 
 
-def test_what_is_asked_out_of_turn_is_refused(tmp_path: Path) -> None:
+def test_requests_in_the_wrong_order_are_refused(tmp_path: Path) -> None:
     """One bag at a time; without one there is nothing to stop, split or pause."""
     with desk(tmp_path) as it:
         for ask in (it.recorder.stop, it.recorder.split, lambda: it.recorder.pause(paused=True)):
@@ -83,7 +83,7 @@ def test_what_is_asked_out_of_turn_is_refused(tmp_path: Path) -> None:
         assert it.recorder.start() == (False, f'{name} is being recorded already')
 
 
-def test_bags_of_one_second_have_names_of_their_own(tmp_path: Path) -> None:
+def test_bags_that_start_in_the_same_second_have_different_names(tmp_path: Path) -> None:
     """Also when the first one has left this disk; and one without messages leaves nothing."""
     with desk(tmp_path) as it:
         names = []
@@ -112,7 +112,7 @@ def test_slices_end_by_size(tmp_path: Path) -> None:
         assert [number for path in slices for number in numbers(path)] == list(range(50))
 
 
-def test_a_full_queue_is_a_loss_with_a_name(tmp_path: Path) -> None:
+def test_a_full_queue_is_a_loss_with_a_reason(tmp_path: Path) -> None:
     """What the queue has no room for is dropped, the newest first, and counted; the rest is recorded."""
     with desk(tmp_path, queue_bytes=1 << 20) as it:
         name = start(it.recorder)
@@ -156,7 +156,7 @@ def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
         assert it.listening == [True] * 4 + [False]
 
 
-def test_what_comes_while_the_next_bag_is_made_is_in_one_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_received_between_two_bags_are_in_one_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its folder is synced to a disk that may be slow, and the intake keeps working."""
     begin = BagState.begin
     with desk(tmp_path, record='always') as it:
@@ -178,9 +178,7 @@ def test_what_comes_while_the_next_bag_is_made_is_in_one_of_them(tmp_path: Path,
         assert it.row()['dropped'] == {}
 
 
-def test_a_bag_that_cannot_be_ended_does_not_keep_the_next_one_from_beginning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bag_that_cannot_end_does_not_prevent_the_next_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever its end raises costs no message of the one that follows."""
     with desk(tmp_path, record='always') as it:
         it.hear(range(10))
@@ -261,7 +259,7 @@ def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch
         assert not list(it.root.iterdir())
 
 
-def test_a_start_that_is_cut_short_is_done_again(tmp_path: Path) -> None:
+def test_an_interrupted_startup_is_repeated(tmp_path: Path) -> None:
     """Whatever of a bag was spooled before a second death, nothing is in the spool twice and the ledger closes."""
     home = tmp_path / 'home'
     with desk(home, record='always') as it:
@@ -297,7 +295,7 @@ def lose_index(home: Path) -> None:
 
 
 @pytest.mark.parametrize('delivered', [0, 1, 2])
-def test_what_is_known_of_a_bag_outlives_the_index(tmp_path: Path, delivered: int) -> None:
+def test_the_state_of_a_bag_survives_the_loss_of_the_index(tmp_path: Path, delivered: int) -> None:
     """Its manifest is the same, whether the slices of before are still on this robot, some of them, or none."""
     home, ends = tmp_path / 'home', []
     with desk(home, record='mission', queue_bytes=1000) as it:

@@ -24,7 +24,7 @@ def row(store: MemoryStore | DirectoryStore, home: Path, name: str = NAME) -> Ba
     return next(each for each in bag_overview(store, 'thor', home) if each.bag == name)
 
 
-def test_a_complete_bag(tmp_path: Path) -> None:
+def test_a_complete_bag_is_described_by_its_manifest(tmp_path: Path) -> None:
     """Its manifest describes it completely."""
     store = MemoryStore()
     write_ours(tmp_path / NAME)
@@ -57,7 +57,7 @@ def test_a_manifest_before_its_slices_is_no_complete_bag(tmp_path: Path) -> None
     assert info_of(store, 'thor', NAME, tmp_path / 'home').missing == [f'{NAME}_1.mcap']
 
 
-def test_bags_of_others_are_foreign(tmp_path: Path) -> None:
+def test_bags_of_other_recorders_are_foreign(tmp_path: Path) -> None:
     """With metadata.yaml, they are described as well; only the size of an archive is known."""
     folder = tmp_path / 'store' / BUCKET / 'thor' / 'rosbags'
     folder.mkdir(parents=True)
@@ -71,7 +71,7 @@ def test_bags_of_others_are_foreign(tmp_path: Path) -> None:
         info_of(store, 'thor', archive.bag, tmp_path)
 
 
-def test_only_those_since(tmp_path: Path) -> None:
+def test_only_bags_since_a_time_are_listed(tmp_path: Path) -> None:
     """By the time at which they began; an older one is not opened for it."""
     store = MemoryStore()
     for name in (NAME, 'patrol_20240101_000000'):
@@ -91,7 +91,7 @@ def test_an_unknown_name_suggests_similar_ones(tmp_path: Path) -> None:
         find_bag(store, 'thor', 'patrol_20251018_12000')
 
 
-def test_info_of_a_folder(tmp_path: Path) -> None:
+def test_a_folder_is_described_like_a_store(tmp_path: Path) -> None:
     """The same as of the store; without metadata.yaml from the slices themselves."""
     write_ours(tmp_path / NAME)
     found = info_folder(tmp_path / NAME)
@@ -112,7 +112,7 @@ def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert [file.name for file in find_bags(store, 'thor')[0].slices][-2:] == [f'{NAME}_9.mcap', f'{NAME}_10.mcap']
 
 
-def test_the_time_in_a_name() -> None:
+def test_the_time_of_a_bag_is_in_its_name() -> None:
     """Of our recordings alone, packed or not."""
     assert time_in_name('patrol_20251018_120000') == time_in_name('patrol_20251018_120000.tar.gz') == T0
     assert time_in_name('rosbag2_2025_10_18-12_00_00') is None

@@ -50,7 +50,7 @@ def test_a_bag_without_damage_is_left_alone(ours: Path) -> None:
     assert [path.name for path in ours.parent.iterdir()] == [NAME]
 
 
-def test_torn_slices_of_a_bag_of_ours(ours: Path, tmp_path: Path) -> None:
+def test_torn_slices_are_repaired_and_the_losses_are_in_the_manifest(ours: Path, tmp_path: Path) -> None:
     """Two of three slices: the copy is a bag that verifies, its manifest lists the losses, and the original is unchanged."""
     tear(ours / f'{NAME}_0.mcap', 200_000)
     tear(ours / f'{NAME}_2.mcap', 10)
@@ -79,7 +79,7 @@ def test_torn_slices_of_a_bag_of_ours(ours: Path, tmp_path: Path) -> None:
         repair_bag(ours)
 
 
-def test_in_place(ours: Path) -> None:
+def test_a_bag_is_repaired_in_place(ours: Path) -> None:
     """The same, where the bag is; a second repair finds nothing."""
     tear(ours / f'{NAME}_1.mcap', 5000)
     found = repair_bag(ours, in_place=True)
@@ -91,7 +91,7 @@ def test_in_place(ours: Path) -> None:
 
 
 @pytest.mark.parametrize('plugin', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-def test_metadata_that_is_missing_or_wrong(tmp_path: Path, plugin: StoragePlugin) -> None:
+def test_missing_or_wrong_metadata_is_rebuilt(tmp_path: Path, plugin: StoragePlugin) -> None:
     """It is rebuilt from the files, as by `ros2 bag reindex`, and other readers open the bag."""
     bag = tmp_path / 'bag'
     write_rosbags(bag, plugin, CompressionMode.NONE)
@@ -112,7 +112,7 @@ def test_metadata_that_is_missing_or_wrong(tmp_path: Path, plugin: StoragePlugin
 
 
 @pytest.mark.parametrize('part', [0.3, 0.7, 0.97])
-def test_a_torn_database(tmp_path: Path, part: float) -> None:
+def test_the_readable_rows_of_a_torn_database_are_kept(tmp_path: Path, part: float) -> None:
     """The readable rows of SQLite are kept; the metadata has the number of lost ones."""
     bag = tmp_path / 'bag'
     write_rosbags(bag, StoragePlugin.SQLITE3, CompressionMode.NONE)
@@ -132,7 +132,7 @@ def test_a_torn_database(tmp_path: Path, part: float) -> None:
     assert set(kept) <= written
 
 
-def test_a_damaged_page_of_a_database(tmp_path: Path) -> None:
+def test_a_damaged_page_costs_only_its_rows(tmp_path: Path) -> None:
     """Only its rows are lost."""
     bag = tmp_path / 'bag'
     write_rosbags(bag, StoragePlugin.SQLITE3, CompressionMode.NONE)
@@ -158,7 +158,7 @@ os._exit(0)
 
 
 @pytest.mark.parametrize('in_place', [False, True])
-def test_a_database_that_was_not_closed(tmp_path: Path, *, in_place: bool) -> None:
+def test_a_database_that_was_not_closed_is_completed(tmp_path: Path, *, in_place: bool) -> None:
     """What its recorder had committed to the write-ahead log is in the result, and the log is not."""
     bag = tmp_path / 'bag'
     write_rosbags(bag, StoragePlugin.SQLITE3, CompressionMode.NONE)
@@ -172,7 +172,7 @@ def test_a_database_that_was_not_closed(tmp_path: Path, *, in_place: bool) -> No
     assert not repair_bag(found.out).is_damaged
 
 
-def test_one_file(tmp_path: Path, ours: Path) -> None:
+def test_a_single_file_is_repaired(tmp_path: Path, ours: Path) -> None:
     """Next to it, at the requested path, or in place; an open slice is renamed."""
     path = ours / f'{NAME}_1.mcap'
     tear(path, 300_000)
@@ -190,7 +190,7 @@ def test_one_file(tmp_path: Path, ours: Path) -> None:
     assert not repair_bag(path).is_damaged
 
 
-def test_what_is_no_bag_at_all(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_a_bag_is_refused(tmp_path: Path) -> None:
     """A clear error, and nothing is written."""
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'noise.mcap').write_bytes(b'no bag at all' * 50)
@@ -204,7 +204,7 @@ def test_what_is_no_bag_at_all(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ['bag', 'empty', 'noise.mcap']
 
 
-def test_one_file_of_which_nothing_can_be_read(ours: Path) -> None:
+def test_an_unreadable_file_of_a_bag_does_not_stop_the_repair(ours: Path) -> None:
     """The others are repaired, and it is reported; in place, it is unchanged."""
     (ours / f'{NAME}_0.mcap').write_bytes(b'no bag at all' * 50)
     tear(ours / f'{NAME}_1.mcap', 5000)
@@ -217,7 +217,7 @@ def test_one_file_of_which_nothing_can_be_read(ours: Path) -> None:
     assert (ours / f'{NAME}_0.mcap').read_bytes() == b'no bag at all' * 50
 
 
-def test_the_other_parts_of_a_torn_bag(ours: Path, tmp_path: Path) -> None:
+def test_the_intact_files_of_a_torn_bag_can_be_cut(ours: Path, tmp_path: Path) -> None:
     """`cut` copies them, `verify` names the torn one, and both say how it is repaired."""
     tear(ours / f'{NAME}_1.mcap', 5000)
     found = cut_folder(ours, tmp_path / 'piece', Choice())
@@ -240,7 +240,7 @@ repair_bag(Path(sys.argv[1]), in_place=True)
 @pytest.mark.parametrize(
     'after_s', [0.0, 0.02, 0.1, *(pytest.param(0.01 * more, marks=pytest.mark.long('kills')) for more in range(20, 60, 2))]
 )
-def test_killed_in_place(tmp_path: Path, after_s: float) -> None:
+def test_a_kill_during_a_repair_in_place_loses_nothing(tmp_path: Path, after_s: float) -> None:
     """Each file is the old one or the new one, and the next repair completes what is left."""
     bag = tmp_path / NAME
     write_ours(bag)
@@ -266,6 +266,6 @@ def test_killed_in_place(tmp_path: Path, after_s: float) -> None:
     assert not verify_folder(bag, deep=True).findings
 
 
-def test_what_is_reported_is_plain_data() -> None:
+def test_the_report_is_plain_data() -> None:
     """For --json."""
     assert BagRepair(Path('a'), None, ()).is_damaged is False

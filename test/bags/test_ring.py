@@ -24,7 +24,7 @@ def told(held: RingItem) -> list[int]:
     return [message.number for message in held.batch.messages if message.number is not None]
 
 
-def test_what_is_too_old_goes() -> None:
+def test_messages_that_are_too_old_are_discarded() -> None:
     """Of unclaimed messages, the last seconds are kept, in order of arrival."""
     ring = Ring(1 << 20, KEEP_S)
     for second in range(30):
@@ -34,7 +34,7 @@ def test_what_is_too_old_goes() -> None:
     assert ring.bytes == 0
 
 
-def test_what_is_too_much_goes_the_oldest_first() -> None:
+def test_the_oldest_messages_are_discarded_when_the_ring_is_full() -> None:
     """Whatever the time: the bytes count, with what Python needs for each message."""
     ring = Ring(10 * (12 + MESSAGE_BYTES), KEEP_S)
     for number in range(25):
@@ -43,7 +43,7 @@ def test_what_is_too_much_goes_the_oldest_first() -> None:
     assert kept(ring) == list(range(15, 25))
 
 
-def test_a_large_lot_goes_in_pieces() -> None:
+def test_a_large_claim_is_written_in_pieces() -> None:
     """One drain of a fast camera does not push out a whole second; what was lost with it belongs to its end."""
     ring = Ring(8 * PIECE_BYTES, KEEP_S)
     ring.put(batch(range(10), size=PIECE_BYTES // 2), {'transport': 3}, 0.0)
@@ -71,7 +71,7 @@ def test_messages_are_not_copied() -> None:
     assert all(out.cdr is given.cdr for out, given in zip(held.batch.messages, taken, strict=True))
 
 
-def test_while_it_is_claimed_nothing_grows_old() -> None:
+def test_claimed_messages_do_not_expire() -> None:
     """Claimed messages wait until the event takes them or newer ones need the room, which is reported."""
     ring = Ring(5 * (12 + MESSAGE_BYTES), KEEP_S)
     for second in range(3):
@@ -136,7 +136,7 @@ def of_event(ring: Ring) -> list[tuple[str, str | None, list[int], bool]]:
     return [(held.batch.topic, held.batch.messages[0].publisher, told(held), held.repeated) for held in found]
 
 
-def test_what_is_latched_is_at_the_start_of_each_event() -> None:
+def test_latched_messages_are_at_the_start_of_each_event() -> None:
     """The last message of each publisher, however long ago it left the ring, with the time of the oldest that is there."""
     ring = Ring(1 << 20, KEEP_S)
     ring.put(latched(1, 2), None, 0.0)
@@ -159,7 +159,7 @@ def test_what_is_latched_is_at_the_start_of_each_event() -> None:
     assert of_event(ring) == [('/tf_static', 'q', [5], True), ('/tf_static', 'p', [3], True)]
 
 
-def test_without_senders_as_many_are_latched_as_there_are() -> None:
+def test_without_publisher_ids_one_message_is_latched_per_publisher() -> None:
     """Where the middleware does not say who sent what (Humble), the last ones stay, as many as there are publishers."""
     ring = Ring(1 << 20, KEEP_S)
     ring.put(latched(1, 2, 3, publisher=None), None, 0.0)
@@ -180,7 +180,7 @@ def test_an_event_starts_with_latched_messages() -> None:
     assert held.batch.messages[0].received_ns == 79
 
 
-def test_what_is_latched_counts_as_bytes() -> None:
+def test_latched_messages_count_against_the_byte_limit() -> None:
     """At most half of the ring is for it; when that is full, the oldest messages of the same topic are dropped."""
     ring = Ring(1 << 20, KEEP_S)
     for number in range(12):

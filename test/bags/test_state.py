@@ -95,7 +95,7 @@ def test_the_last_record_of_a_slice_counts(tmp_path: Path) -> None:
     {'slices': '[[0, 1, "", 1, 2, 3, "[-1]"]]'}, {'slices': '[[0, 1, 7, 1, 2, 3, "[]"]]'}, {'slices': '[[0, 1, "", 1, 2, 3, 7]]'},
     {'missing': '[[0, 7, "what", null, null, null]]'}, {'missing': '[' * 100_000}, {'slices': 'x'},
 ])  # fmt: skip
-def test_what_makes_no_sense_is_refused(state: BagState, change: dict[str, str]) -> None:
+def test_an_implausible_state_is_refused(state: BagState, change: dict[str, str]) -> None:
     """Whatever a flipped bit or another program made of it."""
     with pytest.raises(BagDamaged):
         BagState.of_record(state.folder, 'thor', {**state.record('thor', 2), **change})

@@ -76,7 +76,7 @@ def test_finished_bags_are_uploaded_unchanged(
     assert list((settings.home / 'sending').iterdir()) == []
 
 
-def test_twice_is_once(settings: Settings, tmp_path: Path) -> None:
+def test_uploading_twice_uploads_once(settings: Settings, tmp_path: Path) -> None:
     """The second time nothing is spooled, and the answer is the same."""
     write_ours(tmp_path / NAME)
     assert send(settings, tmp_path / NAME) == send(settings, tmp_path / NAME)
@@ -103,7 +103,7 @@ def test_another_bag_of_that_name_is_refused(settings: Settings, store: Director
     assert len(find_bag(store, 'thor', NAME).files) == 3
 
 
-def test_an_archive_is_the_guides(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+def test_an_archive_has_the_layout_of_the_guide(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
     """thor/rosbags/<name>.tar.gz with the bag's folder in it; made twice it is the same bytes."""
     write_ours(tmp_path / NAME)
     assert send(settings, tmp_path / NAME, is_archive=True).is_delivered
@@ -162,7 +162,7 @@ def test_an_unfinished_bag_is_refused(settings: Settings, tmp_path: Path, what: 
     assert not settings.home.exists()
 
 
-def test_a_bag_that_is_changed_after_it_was_spooled(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+def test_a_bag_that_changes_after_it_was_spooled_is_reported(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
     """What small files were is sent; a slice that is not what it was is refused, and never sent under its name."""
     write_ours(tmp_path / NAME, slices=2, each=1500)
     before = contents(tmp_path / NAME)
@@ -283,7 +283,7 @@ def test_a_bag_is_removed_only_when_the_store_has_it(settings: Settings, store: 
     assert sorted(path.name for path in folder.iterdir() if path.is_dir()) == ['changed', 'kept']
 
 
-def test_one_bad_bag_costs_itself_alone(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
+def test_one_bad_bag_does_not_stop_the_others(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
     """It is reported once, and the others are uploaded."""
     hand, folder = Hand(), tmp_path / 'recordings'
     write_ours(folder / 'bad', slices=2, each=10)
@@ -307,7 +307,7 @@ def test_a_damaged_list_of_sent_bags_is_an_error(settings: Settings, tmp_path: P
         watch(settings, tmp_path, Hand()).round()
 
 
-def test_two_do_not_watch_one_folder(settings: Settings, tmp_path: Path) -> None:
+def test_only_one_process_watches_a_folder(settings: Settings, tmp_path: Path) -> None:
     """The second one gets an error."""
     watching = watch(settings, tmp_path, Hand())
     with (

@@ -44,7 +44,7 @@ def test_an_intact_bag_passes(folder: Path, deep: bool) -> None:
         assert len(found.checks) == 3
 
 
-def test_a_store_is_read_sparingly(folder: Path) -> None:
+def test_a_store_is_asked_for_little(folder: Path) -> None:
     """Without --deep no slice is downloaded: its summary is enough; with it every byte is read once, and the summaries."""
     store = MemoryStore()
     stored(store, folder)
@@ -73,14 +73,14 @@ def lose(folder: Path) -> None:
 
 
 @pytest.mark.parametrize('damage', [flip, cut_off, exchange, lose])
-def test_damage_is_found(folder: Path, damage: Callable[[Path], None]) -> None:
+def test_damage_is_reported(folder: Path, damage: Callable[[Path], None]) -> None:
     """The slice is named, by --deep from the store, and in a folder always."""
     damage(folder)
     for found in (verify_folder(folder), verify_folder(folder, deep=True), remotely(folder, deep=True)):
         assert [check.name for check in found.findings] == [FIRST]
 
 
-def test_a_bag_without_a_manifest_is_held_against_its_metadata(folder: Path) -> None:
+def test_a_bag_without_a_manifest_is_compared_with_its_metadata(folder: Path) -> None:
     """A flipped bit shows by the CRC of its chunk, with --deep."""
     (folder / 'manifest.json').unlink()
     assert verify_folder(folder).state == 'foreign'
@@ -111,7 +111,7 @@ def only(folder: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize(('plugin', 'name'), [(StoragePlugin.SQLITE3, 'theirs.db3'), (StoragePlugin.MCAP, 'theirs.mcap')])
-def test_bags_of_others(tmp_path: Path, plugin: StoragePlugin, name: str) -> None:
+def test_bags_of_other_recorders_are_verified(tmp_path: Path, plugin: StoragePlugin, name: str) -> None:
     """Messages are counted; a lost one is found."""
     folder = tmp_path / 'theirs'
     write_rosbags(folder, plugin, CompressionMode.NONE)

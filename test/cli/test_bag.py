@@ -39,7 +39,7 @@ def said(result: Result) -> object:
     return json.loads(result.stdout)
 
 
-def test_list(home: Path) -> None:
+def test_bags_are_listed(home: Path) -> None:
     """A line a bag; nothing there is no error, and says where it looked."""
     found = run(home, 'list')
     assert found.return_value == 0
@@ -56,7 +56,7 @@ def test_list(home: Path) -> None:
     assert len(said(run(home, 'list', '--since', '2025-10-18T14:00:00+02:00', '--json'))) == 1  # type: ignore[arg-type]
 
 
-def test_info(home: Path) -> None:
+def test_info_shows_topics_and_slices(home: Path) -> None:
     """Topics with types and rates, and the slices; of a folder the same."""
     found = run(home, 'info', NAME)
     assert found.return_value == 0
@@ -68,7 +68,7 @@ def test_info(home: Path) -> None:
     assert json.loads(run(home, 'info', folder, '--json').output)['messages'] == told['messages'] == 1650
 
 
-def test_verify_by_its_exit_code(home: Path) -> None:
+def test_verify_has_an_exit_code_for_each_result(home: Path) -> None:
     """0 for a whole bag, 1 for one that is damaged, or growing."""
     assert run(home, 'verify', NAME).return_value == 0
     folder = home / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
@@ -85,7 +85,7 @@ def test_verify_by_its_exit_code(home: Path) -> None:
     assert said(run(home, 'verify', NAME, '--json'))['is_complete'] is False  # type: ignore[index]
 
 
-def test_fetch_and_cut(home: Path, tmp_path: Path) -> None:
+def test_a_second_fetch_downloads_nothing_and_a_cut_reads_little(home: Path, tmp_path: Path) -> None:
     """A second fetch says that nothing was downloaded; a cut says how little was read."""
     assert 'downloaded 3' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
     assert 'downloaded 0 B' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
@@ -100,7 +100,7 @@ def test_fetch_and_cut(home: Path, tmp_path: Path) -> None:
     assert run(home, 'verify', tmp_path / 'other').return_value == 0
 
 
-def test_upload_and_watch(home: Path, tmp_path: Path) -> None:
+def test_uploaded_and_watched_bags_are_confirmed_by_the_store(home: Path, tmp_path: Path) -> None:
     """Confirmed by the store, and found there."""
     write_ours(tmp_path / 'recordings' / 'by_hand', slices=1, each=20)
     found = run(home, 'upload', tmp_path / 'recordings' / 'by_hand', '--bag-name', 'named')
@@ -142,7 +142,7 @@ def test_errors_have_remedies(home: Path, arguments: tuple[str, ...], error: typ
     assert text in getattr(found.exception, 'message', str(found.exception))
 
 
-def test_from_a_real_server(seaweed: Tower, tmp_path: Path) -> None:
+def test_every_verb_works_with_an_s3_server(seaweed: Tower, tmp_path: Path) -> None:
     """The whole round over S3: send, list, look, check, download, cut."""
     write_ours(tmp_path / 'far')
     environ = seaweed.environment()
@@ -181,14 +181,14 @@ def test_reading_needs_neither_ros_nor_a_spool(home: Path) -> None:
 
 
 @pytest.mark.parametrize('verb', ['list', 'info', 'verify', 'fetch', 'cut', 'upload', 'watch', 'record'])
-def test_help_is_enough(verb: str) -> None:
+def test_the_help_has_every_verb(verb: str) -> None:
     """Every option has a text, and the verb says what it does."""
     command = bag.commands[verb]
     assert command.help
     assert all(option.help for option in command.params if isinstance(option, click.Option))
 
 
-def test_a_bag_with_counters_as_times(tmp_path: Path) -> None:
+def test_a_bag_whose_times_are_counters_has_no_rates(tmp_path: Path) -> None:
     """Some 400 ns have no rates, shares stay below 100 %, one is no plural, and a file in a folder needs no fetch."""
     home, folder = tmp_path / 'home', tmp_path / 'b'
 
@@ -226,7 +226,7 @@ def test_a_folder_without_a_slash_is_hinted_at(home: Path, tmp_path: Path, monke
     assert './mine' in error.remedy
 
 
-def test_repair(tmp_path: Path) -> None:
+def test_repair_reports_damage_and_losses(tmp_path: Path) -> None:
     """It says what was damaged, lost and rebuilt, in words and as JSON; exit code 1 if something was, 0 if nothing is."""
     folder = tmp_path / NAME
     write_ours(folder)

@@ -58,7 +58,7 @@ def test_findings_come_after_the_verdict(found: list[model.Result], tmp_path: Pa
     assert 'as it should be' not in answer.stdout
 
 
-def test_nothing_wrong(found: list[model.Result], tmp_path: Path) -> None:
+def test_without_findings_the_exit_code_is_0(found: list[model.Result], tmp_path: Path) -> None:
     """Exit code 0, also where there is something good to know; -v shows what is fine."""
     found += [FINE, SAID]
     answer = run(tmp_path, '-v')
@@ -67,7 +67,7 @@ def test_nothing_wrong(found: list[model.Result], tmp_path: Path) -> None:
     assert 'ok some.fine: as it should be' in answer.stdout
 
 
-def test_json(found: list[model.Result], tmp_path: Path) -> None:
+def test_json_is_one_document(found: list[model.Result], tmp_path: Path) -> None:
     """One document, whatever was found."""
     found += [FINE, BAD]
     answer = run(tmp_path, '--json', '--role', 'workstation', SHADOWHOUND_ROBOT='tachi')
@@ -82,7 +82,7 @@ def test_json(found: list[model.Result], tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_only_some(found: list[model.Result], tmp_path: Path) -> None:
+def test_checks_are_selected_by_name_or_prefix(found: list[model.Result], tmp_path: Path) -> None:
     """A name, or what names begin with."""
     found.append(BAD)
     assert run(tmp_path, '--only', 'some.part').return_value == 0
@@ -99,14 +99,16 @@ def test_only_some(found: list[model.Result], tmp_path: Path) -> None:
     ],
     ids=lambda given: given[0] if isinstance(given, tuple) else given,
 )  # fmt: skip
-def test_bad_usage(found: list[model.Result], tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
+def test_an_unknown_check_is_wrong_usage(
+    found: list[model.Result], tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
     """Is refused with what is allowed, before anything is asked."""
     error = run(tmp_path, *arguments).exception
     assert isinstance(error, click.UsageError)
     assert words in f'{error.format_message()} {getattr(error, "remedy", "")}'
 
 
-def test_an_invalid_parameter_file(found: list[model.Result], tmp_path: Path) -> None:
+def test_an_invalid_parameter_file_is_wrong_usage(found: list[model.Result], tmp_path: Path) -> None:
     """Is bad usage as well, and names the file."""
     (tmp_path / 'a.yaml').write_text('- no mapping')
     error = run(tmp_path, '--params-file', str(tmp_path / 'a.yaml')).exception
@@ -114,7 +116,7 @@ def test_an_invalid_parameter_file(found: list[model.Result], tmp_path: Path) ->
     assert 'a.yaml is not a parameter file' in error.format_message()
 
 
-def test_a_setting_that_the_node_would_refuse(tmp_path: Path) -> None:
+def test_a_setting_that_the_node_would_refuse_is_a_finding(tmp_path: Path) -> None:
     """Of the parameter file it was given, by the real check."""
     (tmp_path / 'a.yaml').write_text('/**:\n  ros__parameters:\n    camera:\n      rate: 3.0\n    imu: {batch_s: 2.0}\n')
     answer = run(tmp_path, '--params-file', str(tmp_path / 'a.yaml'), '--only', 'environment', '--json')

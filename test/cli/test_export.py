@@ -61,7 +61,7 @@ def machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Machine, 
     return Machine(tmp_path / 'a', house.settings.directory), Machine(tmp_path / 'b', house.settings.directory)
 
 
-def test_two_machines_add_to_one_data_set(machines: tuple[Machine, Machine], tmp_path: Path) -> None:
+def test_two_machines_add_to_one_dataset(machines: tuple[Machine, Machine], tmp_path: Path) -> None:
     """What the other one added is there still, in its place."""
     a, b = machines
     assert a.add('one') == ['one']
@@ -116,7 +116,7 @@ def cutting(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
 
 @pytest.mark.parametrize('files', [0, 1, 5])
-def test_a_drop_with_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None], files: int,
+def test_a_drop_completes_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None], files: int,
                                          tmp_path: Path) -> None:  # fmt: skip
     """The other machine waits for it rather than bring the mission back; told again, the first one takes it out."""
     a, b = machines
@@ -135,7 +135,7 @@ def test_a_drop_with_an_interrupted_upload(machines: tuple[Machine, Machine], cu
     assert a.add('one') == []
 
 
-def test_an_export_with_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None]) -> None:
+def test_an_export_completes_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None]) -> None:
     """A mission is taken out of what only this machine has yet, and of what of it was uploaded."""
     a, b = machines
     a.add('one')
@@ -162,7 +162,7 @@ def test_the_last_episode_is_taken_out(machines: tuple[Machine, Machine]) -> Non
     assert a.ask('verify', URL, '--all')['wrong'] == []
 
 
-def test_data_sets_are_named_without_mlflow(machines: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_datasets_are_named_without_mlflow(machines: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch) -> None:
     """Which models were trained on them is not known then, which is not the same as none."""
     a, _ = machines
     a.add('one')

@@ -43,7 +43,7 @@ def files(home: Path) -> list[str]:
     return sorted(name for name in found if '_catalog' not in name)
 
 
-def test_by_prefix(home: Path) -> None:
+def test_objects_are_fetched_by_prefix(home: Path) -> None:
     """Each at DIR/KEY; a second time nothing is moved, and it says so."""
     found = run(home, 'thor/camera/')
     assert found.return_value == 0
@@ -54,7 +54,7 @@ def test_by_prefix(home: Path) -> None:
     assert (home / 'data' / files(home)[0]).read_bytes() == content('camera', TIMES[0])
 
 
-def test_by_question(home: Path) -> None:
+def test_objects_are_fetched_by_query(home: Path) -> None:
     """What the flags ask for, the earliest where there is a limit."""
     told = json.loads(run(home, '--sensor', 'odom', '--since', '2026-10-28T12:00:01', '--limit', '2', '--json').output)
     assert (told['asked'], told['moved']) == (2, 2)
@@ -63,7 +63,7 @@ def test_by_question(home: Path) -> None:
     assert 'No objects under thor/lidar/ in the bucket x' in run(home, 'thor/lidar/', '--bucket', 'x').output
 
 
-def test_what_cannot_be_fetched_is_a_finding(home: Path) -> None:
+def test_an_object_that_cannot_be_fetched_is_a_finding(home: Path) -> None:
     """Exit code 1, the key and the reason; the rest is there."""
     gone = row('odom', TIMES[0])['key']
     (home / 'store' / 'sensor-data' / gone).unlink()
@@ -86,13 +86,13 @@ def test_a_repeat_is_not_fetched_twice(home: Path) -> None:
     assert sorted(rows) == sorted([*TIMES, again['t_start_ns']])
 
 
-def test_bad_usage(home: Path) -> None:
+def test_a_prefix_or_a_query_is_required(home: Path) -> None:
     """Neither or both of prefix and question; a time that is none."""
     for arguments in ([], ['thor/', '--sensor', 'odom'], ['--since', 'soon']):
         assert isinstance(run(home, *arguments).exception, click.UsageError)
 
 
-def test_by_the_times_of_an_answer(home: Path) -> None:
+def test_objects_are_fetched_by_the_times_of_an_answer(home: Path) -> None:
     """Objects that reach into one of them, of its robot."""
     times = [
         {'robot': 'thor', 'since_ns': TIMES[1], 'until_ns': TIMES[2]},

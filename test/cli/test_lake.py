@@ -28,7 +28,7 @@ def run(home: Path, *arguments: str) -> Result:
     return CliRunner().invoke(lake, arguments, env=env, standalone_mode=True)
 
 
-def test_status_before_and_after_ingest(home: Path) -> None:
+def test_status_counts_waiting_and_ingested_rows(home: Path) -> None:
     """Row files wait, then their rows are in the tables; a row that was rejected is counted."""
     (before,) = json.loads(run(home, 'status', '--json').output)
     assert (before['robot'], before['objects'], before['waiting'], before['first']) == ('thor', 0, 24, None)
@@ -113,7 +113,7 @@ def test_prune_takes_a_name_that_nothing_has_for_wrong_usage(home: Path, argumen
     assert json.loads(ended(home, 'prune', '--keep', 'camera 1d', '--dry-run', '--json').output)['going'] == 96
 
 
-def test_bad_usage(home: Path) -> None:
+def test_a_robot_is_required(home: Path) -> None:
     """No robot."""
     assert run(home, 'reindex').exit_code == 2
 
@@ -132,7 +132,7 @@ def told(tmp_path: Path) -> Path:
 TWO_HOURS = ('coverage', '--since', '2026-10-28T12:00', '--until', '2026-10-28T14:00')
 
 
-def test_coverage_as_a_table(told: Path) -> None:
+def test_coverage_is_printed_as_a_table(told: Path) -> None:
     """What was stored, downsampled, lost and why, and what nobody knows, an hour a line."""
     found = run(told, *TWO_HOURS)
     assert found.exit_code == 0
@@ -146,7 +146,7 @@ def test_coverage_as_a_table(told: Path) -> None:
     assert 'thor /odom: 12 messages were lost at unknown times.' in found.stdout
 
 
-def test_coverage_for_programs(told: Path) -> None:
+def test_coverage_is_printed_as_json(told: Path) -> None:
     """Seconds of each hour, and up to when it is known."""
     (imu,) = json.loads(run(told, *TWO_HOURS, '--topic', '/imu', '--json').stdout)
     assert imu['hours'] == [
@@ -156,7 +156,7 @@ def test_coverage_for_programs(told: Path) -> None:
     assert (imu['complete_ns'], imu['gaps'], imu['untimed']) == (NOON_NS + 7200 * 10**9, 2, 0)
 
 
-def test_coverage_as_a_picture(told: Path, tmp_path: Path) -> None:
+def test_coverage_is_drawn_as_an_image(told: Path, tmp_path: Path) -> None:
     """Blue where it is stored, red where it is lost, gray where nobody knows."""
     assert run(told, *TWO_HOURS, '--chart', str(tmp_path / 'coverage.png')).exit_code == 0
     with Image.open(tmp_path / 'coverage.png') as picture:
@@ -164,7 +164,7 @@ def test_coverage_as_a_picture(told: Path, tmp_path: Path) -> None:
     assert colors >= {(0x1F, 0x6F, 0xB2), (0xC0, 0x39, 0x2B), (0x9C, 0xC4, 0xE4), (0xC7, 0xCF, 0xD6)}
 
 
-def test_coverage_without_gap_reports(told: Path) -> None:
+def test_coverage_without_gap_reports_is_unknown(told: Path) -> None:
     """A topic of which nothing is known is not known; a time that is none is bad usage."""
     assert '100 %' in run(told, *TWO_HOURS, '--robot', 'thor', '--topic', '/scan').stdout
     assert 'Nothing is known' in run(told, *TWO_HOURS, '--robot', 'tachi').stdout

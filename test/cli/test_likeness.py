@@ -47,7 +47,7 @@ def run(home: Path, *arguments: str) -> Result:
     return CliRunner().invoke(command, arguments[1:], env=env, standalone_mode=arguments[0] == 'query')
 
 
-def test_embed_then_ask(home: Path) -> None:
+def test_similar_images_are_found_after_embedding(home: Path) -> None:
     asked = run(home, 'query', '--like', str(home / 'red.png'), '--model', str(home / 'colors'))
     assert '3 of 3 pictures have no vector by the model colors' in asked.output
     assert f'shadowhound-data lake embed --model {home / "colors"} makes them' in asked.output
@@ -80,7 +80,7 @@ def test_a_sensor_that_does_not_exist_is_wrong_usage(home: Path) -> None:
     (['--like', 'red.png', '--model', '.'], 'has no image model'),
     (['--like', 'notes.txt', '--model', 'colors'], 'cannot be compared'),
 ])  # fmt: skip
-def test_what_is_no_question(home: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], says: str) -> None:
+def test_an_invalid_question_is_wrong_usage(home: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], says: str) -> None:
     monkeypatch.chdir(home)
     Path('notes.txt').write_text('no picture')
     found = run(home, 'query', *arguments)

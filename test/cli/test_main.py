@@ -1,4 +1,7 @@
-"""Every verb helps with an example, every error says what to do, and every verb ends with an exit code of the table."""
+"""Every verb helps with an example, every error says what to do, and every verb ends with an exit code of the table.
+
+Completion works in a real bash, with the file that the package installs and with click's own line.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,14 @@ import importlib
 import json
 import os
 import pkgutil
+import pty
 import re
+import select
 import shlex
 import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -248,7 +254,7 @@ def test_an_error_is_json_where_the_answer_would_be(
 
 
 @pytest.mark.parametrize('arguments', [(), ('missions',), ('node', 'bag')])
-def test_a_group_without_a_verb_helps(
+def test_a_group_without_a_verb_prints_its_help(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]
 ) -> None:
     """It is no error with a remedy, but the help itself."""
@@ -259,7 +265,9 @@ def test_a_group_without_a_verb_helps(
     assert '->' not in lines[-1]
 
 
-def test_the_environment_is_usage_too(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_environment_is_wrong_usage(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As with the node: a setting that is refused is 2."""
     assert home.is_dir()
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'tower:9000')
@@ -269,7 +277,7 @@ def test_the_environment_is_usage_too(home: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(('error', 'code'), [(KeyboardInterrupt(), ExitCode.INTERRUPTED), (BadUsage('x', 'y'), ExitCode.USAGE)])
-def test_how_it_ends(
+def test_every_kind_of_error_has_its_exit_code(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, code: ExitCode
 ) -> None:
     """Ctrl-C is 130, as for a shell."""
@@ -347,7 +355,7 @@ def spool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / 'spool'
 
 
-def test_verbs_are_about_the_robot_of_this_machine(spool: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbs_use_the_robot_of_this_machine(spool: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The one whose node has run here; if there are several, they ask."""
     written(spool, robot='turtle')
     assert the_robot(None) == 'turtle'
@@ -368,9 +376,70 @@ def test_verbs_are_about_the_robot_of_this_machine(spool: Path, capsys: pytest.C
         cli(['bag', 'list'], standalone_mode=False)
 
 
-def test_an_ambiguous_robot(spool: Path) -> None:
+def test_an_ambiguous_robot_is_wrong_usage(spool: Path) -> None:
     """Not even the store: it is the node's default, unless something must exist."""
     assert the_robot(None, in_store=True) == 'thor'
     with pytest.raises(BadUsage, match='none'):
         the_robot(None, in_store=True, must_exist=True)
     assert not list(spool.iterdir())
+
+
+FILE = Path(__file__).parents[2] / 'resource/completion/shadowhound-data'
+CLICKS = 'eval "$(_SHADOWHOUND_DATA_COMPLETE=bash_source shadowhound-data)"'
+
+
+@pytest.fixture
+def shell(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The program of this environment is in PATH, and its home is empty."""
+    monkeypatch.setenv('PATH', f'{Path(sys.executable).parent}{os.pathsep}{os.environ["PATH"]}')
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+
+
+@pytest.mark.usefixtures('shell')
+@pytest.mark.parametrize('how', [f'source {FILE}', CLICKS], ids=['file', 'line'])
+def test_verbs_options_and_choices_are_completed(how: str) -> None:
+    """As bash calls the function for each word before the cursor."""
+    script = (
+        how
+        + """
+        for line in 'led' 'bag ve' 'query --sens' 'query --format ' 'node bag st'; do
+            COMP_WORDS=(shadowhound-data $line); COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); COMPREPLY=()
+            [ "${line% }" = "$line" ] || { COMP_WORDS+=(''); COMP_CWORD=$((COMP_CWORD + 1)); }
+            _shadowhound_data_completion shadowhound-data
+            echo "${COMPREPLY[@]}"
+        done"""
+    )
+    said = subprocess.run(['bash', '--norc', '-c', script], capture_output=True, text=True, check=True, timeout=250).stdout
+    assert said.splitlines() == ['ledger', 'verify', '--sensor', 'table csv json keys', 'start stop']
+
+
+@pytest.mark.usefixtures('shell')
+def test_a_terminal_completes_with_tab() -> None:
+    """In an interactive bash, up to the space behind the verb."""
+    process, terminal = pty.fork()
+    if process == 0:
+        os.execvp('bash', ['bash', '--norc', '--noprofile', '-i'])  # noqa: S606 - a bash that a person types into
+    try:
+        os.write(terminal, f'source {FILE}; bind "set enable-bracketed-paste off"\r'.encode())
+        os.write(terminal, b'shadowhound-data miss\t')
+        seen, deadline = b'', time.monotonic() + 250
+        while b'shadowhound-data missions ' not in seen:
+            assert time.monotonic() < deadline, seen
+            if select.select([terminal], [], [], 1.0)[0]:
+                seen += os.read(terminal, 4096)
+    finally:
+        os.write(terminal, b'\x03exit\r')
+        os.close(terminal)
+        os.waitpid(process, 0)
+
+
+@pytest.mark.usefixtures('shell')
+def test_verbs_are_completed_without_importing_them() -> None:
+    """Each word would otherwise take as long as the slowest verb."""
+    code = """import sys, click
+from shadowhound_data_logger.cli.main import cli
+print(*[each.value for each in cli.shell_complete(click.Context(cli), '')])
+print(*(name for name in sys.modules if name.startswith('shadowhound_data_logger.cli.')))"""
+    verbs, modules = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert {'doctor', 'policy'} < set(verbs.split())
+    assert set(modules.split()) == {'shadowhound_data_logger.cli.common', 'shadowhound_data_logger.cli.main'}

@@ -89,7 +89,7 @@ def test_a_mission_being_sent_needs_no_resume(tmp_path: Path) -> None:
     assert 'resume' not in text
 
 
-def test_a_list_does_not_read_what_is_sent(tmp_path: Path) -> None:
+def test_the_list_does_not_read_sent_records(tmp_path: Path) -> None:
     """A mission that is sent whole is told by its summary, in the same words as by its journal."""
     mission_id = fly(tmp_path)
     deliver(tmp_path, mission_id)
@@ -165,7 +165,7 @@ def test_an_export_has_all_that_was_logged(tmp_path: Path) -> None:
     assert ('metric', 'people_met', '2.0', '3') in {(row['kind'], row['key'], row['value'], row['step']) for row in rows}
 
 
-def test_what_cannot_be_sent_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_record_that_cannot_be_sent_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the deadline it says what is left, with exit code 1."""
     monkeypatch.setattr(Replayer, 'start', lambda _: None)
     mission_id = fly(tmp_path)
@@ -177,7 +177,7 @@ def test_what_cannot_be_sent_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (found.return_value, [each['mission_id'] for each in json.loads(found.stdout)['left']]) == (1, [mission_id])
 
 
-def test_what_is_left_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unsent_records_are_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sender is started for it, and with nothing left nothing is."""
     mission_id = fly(tmp_path)
     started: list[Replayer] = []

@@ -80,7 +80,7 @@ def test_each_verb_sends_its_command(serving: Serving, words: list[str], request
     assert json.loads(run(*words, '--json').stdout) == {'ok': True, 'robot': 'thor', 'message': f'{request_["do"]} is done'}
 
 
-def test_what_the_node_refuses_is_a_finding(serving: Serving) -> None:
+def test_a_request_that_the_node_refuses_is_a_finding(serving: Serving) -> None:
     """Exit code 1, and its words on standard error; with --json on standard output."""
     result = run('bag', 'stop')
     assert (result.return_value, result.stdout) == (1, '')
@@ -108,7 +108,7 @@ def test_the_parameters_are_listed(serving: Serving) -> None:
     assert "no parameters of 'camra'; there are camera, camera_info, robot" in result.stderr
 
 
-def test_the_node_of_a_robot(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_is_selected_by_its_robot(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is named by option or environment; where several run without a name, nothing is done."""
     assert run('flush', '--robot', 'thor').return_value == 0
     monkeypatch.setenv('SHADOWHOUND_ROBOT', 'tachi')

@@ -77,7 +77,7 @@ def test_a_team_of_one_has_its_keys_with_one_command(team: Team) -> None:
     assert {path: path.read_bytes() for path in team.keys.iterdir()} == before
 
 
-def test_keys_with_a_passphrase(team: Team) -> None:
+def test_keys_with_a_passphrase_are_encrypted(team: Team) -> None:
     """They are no use without it; online.key has none, for cron."""
     team.run('keys', '--encrypt', SHADOWHOUND_KEY_PASSPHRASE='correct horse')
     assert [b'ENCRYPTED' in (team.keys / f'{name}.key').read_bytes() for name in ('root', 'targets', 'online')] == [
@@ -93,7 +93,7 @@ def test_keys_with_a_passphrase(team: Team) -> None:
     team.run('refresh')
 
 
-def test_a_root_with_a_threshold_of_two(team: Team) -> None:
+def test_a_root_with_a_threshold_of_two_needs_two_signatures(team: Team) -> None:
     """Nothing is signed before two of three have; one alone rotates nothing; a robot follows from the first root to the last."""
     people = {name: team.home / 'people' / f'{name}.key' for name in ('alice', 'bob', 'carol')}
     for name in people:
@@ -122,7 +122,7 @@ def test_a_root_with_a_threshold_of_two(team: Team) -> None:
     assert sorted(path.name for path in team.keys.glob('*.next.*')) == []
 
 
-def test_a_rotation_that_was_cut_off(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_rotation_is_completed(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
     """Wherever that was, the next verb ends it: with the new root or, where it was not in the store yet, with it as well."""
     team.run('keys')
     robot = team.robot('thor')
@@ -150,7 +150,7 @@ def _dying(act: Any, after: int) -> Any:
     return dies
 
 
-def test_new_keys_from_where_only_the_root_is(team: Team) -> None:
+def test_new_keys_are_made_with_the_root_alone(team: Team) -> None:
     """The lists in force stay; if something was signed here, what others signed with a copy of the key ends, and is reported."""
     team.run('keys')
     robot = team.robot('thor')
@@ -174,7 +174,7 @@ def test_new_keys_from_where_only_the_root_is(team: Team) -> None:
     assert 'no longer listed: go2/go2_patrol/3' in said
 
 
-def test_two_concurrent_rotations(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_concurrent_rotations_one_is_valid(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only one of two roots of the same number is in force; who was late keeps none of its keys."""
     team.run('keys')
     team.publish('go2/go2_patrol/1')
@@ -193,7 +193,7 @@ def test_two_concurrent_rotations(team: Team, monkeypatch: pytest.MonkeyPatch) -
     assert 'version 3 is in force' in team.run('rotate', 'root', 'online')
 
 
-def test_another_key_signs_some_policies(team: Team) -> None:
+def test_a_delegated_key_signs_some_policies(team: Team) -> None:
     """What it signs waits for a refresh where online.key is; when its right ends, what it signed may not run."""
     team.run('keys')
     robot = team.robot('thor')
@@ -214,7 +214,7 @@ def test_another_key_signs_some_policies(team: Team) -> None:
     assert "nothing is delegated to 'dora'" in team.run('delegate', 'dora', '--revoke', code=1)
 
 
-def test_a_public_key_is_of_who_has_the_private_one(team: Team) -> None:
+def test_a_public_key_must_be_proven_with_its_private_key(team: Team) -> None:
     """A file that was changed, or that claims another key, is refused."""
     team.run('keys')
     for name in ('eve', 'alice'):
@@ -243,7 +243,7 @@ def test_a_version_is_withdrawn(team: Team) -> None:
     assert 'does not list' in team.run('withdraw', 'go2_patrol@7', code=1)
 
 
-def test_two_concurrent_signers(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_concurrent_signers_the_second_repeats(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second one gets an error and repeats it: neither change is lost."""
     team.run('keys')
     team.publish('go2/go2_patrol/1')

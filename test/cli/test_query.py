@@ -41,7 +41,7 @@ def run(home: Path, *arguments: str) -> Result:
     return CliRunner().invoke(query, arguments, env=env, standalone_mode=True)
 
 
-def test_a_table_is_for_reading(home: Path) -> None:
+def test_a_table_fits_the_terminal(home: Path) -> None:
     """The earliest first, with what matters; how many there are, and that more are not shown."""
     found = run(home, '--sensor', 'odom')
     assert '2026-10-28 12:00:00  odom' in found.output
@@ -71,7 +71,7 @@ def test_keys_are_for_other_programs(home: Path) -> None:
     ]  # fmt: skip
 
 
-def test_sql_with_flags(home: Path) -> None:
+def test_flags_restrict_sql(home: Path) -> None:
     """The flags restrict what the views show."""
     found = run(home, 'SELECT mission_id, result, objects FROM missions', '--failed', '--json')
     assert json.loads(found.output) == [{'mission_id': FAILED, 'result': 'FAILED', 'objects': 16}]
@@ -79,7 +79,7 @@ def test_sql_with_flags(home: Path) -> None:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
+def test_a_contact_sheet_is_made_of_the_answer(home: Path, tmp_path: Path) -> None:
     """A contact sheet of the images that can be read, and the places on the ground."""
     sheet, ground = tmp_path / 'sheet.jpg', tmp_path / 'map.png'
     asked = ('--sensor', 'camera', '--until', '2026-10-28T12:00:30', '--near', '0,0,9')
@@ -105,7 +105,7 @@ def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
         (['SELECT sensor FROM objects', '--format', 'keys'], 'bucket and key'), (['--limit', '0'], 'limit'),
     ],
 )  # fmt: skip
-def test_what_is_no_question_is_bad_usage(home: Path, arguments: list[str], says: str) -> None:
+def test_an_invalid_query_is_wrong_usage(home: Path, arguments: list[str], says: str) -> None:
     """Exit code 2, and what was not understood."""
     found = run(home, *arguments)
     assert found.exit_code == 2
@@ -128,7 +128,7 @@ def spoken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('ascii', rb'\u53bb\u53a8\u623f caf\xe9,\u5de1\u903b'), ('latin-1', b'\\u53bb\\u53a8\\u623f caf\xe9,\\u5de1\\u903b'),
     ('utf-8', '去厨房 café,巡逻'.encode()),
 ])  # fmt: skip
-def test_a_csv_for_a_pipe_that_is_not_utf_8(spoken: Path, encoding: str, cells: bytes) -> None:
+def test_csv_is_utf_8_whatever_the_locale(spoken: Path, encoding: str, cells: bytes) -> None:
     """What the encoding does not have is escaped; an argument that the locale cannot hold is one line. No traceback."""
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'query']
     environ = {**os.environ, 'SHADOWHOUND_HOME': str(spoken), 'AWS_ENDPOINT_URL': '', 'PYTHONIOENCODING': encoding,
@@ -143,7 +143,7 @@ def test_a_csv_for_a_pipe_that_is_not_utf_8(spoken: Path, encoding: str, cells: 
 
 
 @pytest.mark.long('a process of its own')
-def test_a_robot_has_no_library_for_it(home: Path, tmp_path: Path) -> None:
+def test_a_missing_library_has_a_remedy(home: Path, tmp_path: Path) -> None:
     """Without Daft it says what to install, as bad usage."""
     (tmp_path / 'deltalake.py').write_text("raise ModuleNotFoundError('no', name='deltalake')\n", encoding='utf-8')
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'query']

@@ -77,7 +77,7 @@ def test_list_shows_the_spool(home: Path) -> None:
     assert 'wait for their date' in text
 
 
-def test_the_same_for_programs(home: Path) -> None:
+def test_the_spool_is_listed_as_json(home: Path) -> None:
     """As JSON, with the reason as a field of its own."""
     found = said()
     assert (found['spool'], found['running'], found['quarantined']) == (f'{home}/spool', [], 1)
@@ -88,7 +88,7 @@ def test_the_same_for_programs(home: Path) -> None:
     }  # fmt: skip
 
 
-def test_an_empty_spool_is_fine(tmp_path: Path) -> None:
+def test_an_empty_spool_is_not_an_error(tmp_path: Path) -> None:
     """Exit code 0, and a sentence."""
     spool = new_spool(tmp_path / 'spool')
     spool.open()
@@ -99,7 +99,7 @@ def test_an_empty_spool_is_fine(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('verb', [(), ('list',), ('drain',), ('retry',), ('resend-gaps',)])
-def test_no_spool(tmp_path: Path, verb: tuple[str, ...]) -> None:
+def test_without_a_spool_every_verb_names_the_folder(tmp_path: Path, verb: tuple[str, ...]) -> None:
     """Every verb says which folder, and what names it; none makes one."""
     answer = run('--spool', str(tmp_path / 'none'), *verb)
     assert isinstance(answer.exception, SpoolError)
@@ -108,7 +108,7 @@ def test_no_spool(tmp_path: Path, verb: tuple[str, ...]) -> None:
     assert not (tmp_path / 'none').exists()
 
 
-def test_a_list(home: Path) -> None:
+def test_objects_are_listed(home: Path) -> None:
     """Each object with its file, which is there; by state, by sensor, by how its name begins, and no more than asked for."""
     found = said('list')
     assert [one['key'] for one in found] == [
@@ -124,7 +124,7 @@ def test_a_list(home: Path) -> None:
     assert 'more than 2' in few.stderr
 
 
-def test_what_was_refused_waits_again(home: Path) -> None:
+def test_refused_objects_are_retried(home: Path) -> None:
     """By its reason; another reason moves nothing, and what waits already stays."""
     assert said('retry', '--reason', 'foreign') == {'objects': 0, 'bytes': 0, 'gone': 0}
     assert states(home)['d.jpg'] == 'quarantined'
@@ -134,7 +134,7 @@ def test_what_was_refused_waits_again(home: Path) -> None:
                             'thor/_unsynced/boot/e.jpg': 'held'}  # fmt: skip
 
 
-def test_one_object_waits_again(home: Path) -> None:
+def test_one_object_is_retried(home: Path) -> None:
     """By its name; one that is not quarantined is a finding."""
     assert run('retry', f'{BUCKET}/thor/camera/a.jpg').return_value == 1
     assert run('retry', f'{BUCKET}/thor/camera/d.jpg').return_value == 0
@@ -148,7 +148,7 @@ def test_gaps_are_resent(home: Path) -> None:
     assert (answer.return_value, answer.stdout) == (0, '1 row of the gap journal will be sent again with the next part\n')
 
 
-def test_a_missing_file_does_not_wait(home: Path) -> None:
+def test_an_object_without_its_file_is_not_retried(home: Path) -> None:
     """It is said, and the object stays what it was."""
     (home / 'spool/quarantine/access_denied' / BUCKET / 'thor/camera/d.jpg').unlink()
     answer = run('retry')
@@ -157,7 +157,7 @@ def test_a_missing_file_does_not_wait(home: Path) -> None:
     assert states(home)['d.jpg'] == 'quarantined'
 
 
-def test_a_death_in_the_middle_of_a_retry(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_retry_is_completed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between the file and its row: the next start finishes it."""
 
     def die(*_: object) -> None:
@@ -174,7 +174,9 @@ def test_a_death_in_the_middle_of_a_retry(home: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize('reopens', [False, True])
-def test_what_waits_again_before_its_file_was_set_apart(home: Path, monkeypatch: pytest.MonkeyPatch, *, reopens: bool) -> None:
+def test_an_object_is_retried_before_its_file_was_quarantined(
+    home: Path, monkeypatch: pytest.MonkeyPatch, *, reopens: bool
+) -> None:
     """A retry, or another process's start, between the row and the file: the file stays where the object waits."""
 
     def meanwhile() -> None:
@@ -245,7 +247,7 @@ def test_an_unreachable_store_is_reported(home: Path, monkeypatch: pytest.Monkey
     assert states(home)['a.jpg'] == 'pending'
 
 
-def test_a_node_delivers_already(home: Path) -> None:
+def test_a_running_node_delivers_alone(home: Path) -> None:
     """Then it says who does, and changes nothing."""
     with flock(home / 'spool/drain.lock'):
         answer = run('drain', '--idle-timeout', '1')

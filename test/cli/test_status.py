@@ -1,4 +1,7 @@
-"""``shadowhound-data status`` on status files made here: what it prints, how wide, its exit codes, and the live view."""
+"""``shadowhound-data status`` on status files made here: what it prints, how wide, its exit codes, and the live view.
+
+A status file that is damaged, foreign or hostile is an error that names it, or unknown figures: never a traceback.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,20 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 
 import pytest
 from click.testing import CliRunner, Result
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from rich.console import Console
 from spool.making import make, new_spool, put
 
-from shadowhound_data_logger.cli.main import main
+from shadowhound_data_logger.cli.common import ExitCode
+from shadowhound_data_logger.cli.main import cli, main
 from shadowhound_data_logger.cli.output import print_page
 from shadowhound_data_logger.cli.status import Page, status, view
 from shadowhound_data_logger.core.clock import SystemClock
@@ -91,7 +99,7 @@ def line(text: str, start: str) -> str:
     return next(each.rstrip() for each in text.splitlines() if each.startswith(start))
 
 
-def test_it_fits_into_80_columns() -> None:
+def test_status_fits_into_80_columns() -> None:
     """A robot that works has no line that is longer, and none that is broken."""
     text = shown()
     assert max(len(each.rstrip()) for each in text.splitlines()) <= 80
@@ -217,7 +225,7 @@ def test_losses_have_columns_only_where_there_are_any() -> None:
     assert line(text, '/imu').split()[-2:] == ['-', '5']
 
 
-def test_topics_that_were_never_heard_are_one_line() -> None:
+def test_topics_without_messages_are_one_line() -> None:
     """Those that nobody publishes and those that are off are named and take no row; one that was heard before keeps it."""
     gone = a_topic(publishers=0, rate_hz=0.0)
     silent = a_topic(publishers=0, received=0, age_s=None)
@@ -249,7 +257,7 @@ def test_problems_have_remedies() -> None:
         ({'busy_s': 75.0}, 'hangs for 1 min 15 s'),
     ],
 )
-def test_a_thread_that_had_trouble(row: dict[str, Any], words: str | None) -> None:
+def test_a_thread_that_failed_is_shown(row: dict[str, Any], words: str | None) -> None:
     """One that failed and works again says how often and why, one that is stuck for how long; others need no line."""
     workers = {'intake': {'failing': False, 'failures': 0, 'last_error': '', 'busy_s': 0.0, **row}}
     text = shown(100, workers=workers, stalls={'intake': 'it takes no messages'} if 'busy_s' in row else {})
@@ -257,7 +265,7 @@ def test_a_thread_that_had_trouble(row: dict[str, Any], words: str | None) -> No
     assert shown_as == ([words] if words else [])
 
 
-def test_text_of_others_is_shown_and_not_obeyed() -> None:
+def test_hostile_text_is_shown_as_text() -> None:
     """Neither markup nor control characters in names and errors have an effect."""
     text = shown(topics={'/[red]a[/red]\x1b[31m': a_topic()}, findings=('[bold]x\r\x07\u202e',),
                  store={'state': 'paused', 'target': '[link=x]y', 'last_error': 'a[/]\nb'})  # fmt: skip
@@ -266,7 +274,7 @@ def test_text_of_others_is_shown_and_not_obeyed() -> None:
     assert not {'\x1b', '\r', '\x07', '\u202e'} & set(text)
 
 
-def test_a_node_that_hangs_shows_when_its_figures_were_true() -> None:
+def test_the_status_of_a_hung_node_shows_its_age() -> None:
     """Not answering: for how long, and its last figures."""
     text = shown(state='not_answering', age_s=80.0, findings=('the node has written no status',))
     assert line(text, 'thor') == 'thor  NOT ANSWERING for 1 min 20 s, process 12345, version 0.1.0'
@@ -274,7 +282,7 @@ def test_a_node_that_hangs_shows_when_its_figures_were_true() -> None:
     assert 'the node has written no status' in text
 
 
-def test_exit_codes_and_json(tmp_path: Path) -> None:
+def test_exit_codes_and_json_have_the_verdict(tmp_path: Path) -> None:
     """0 for a node that works, 1 with a finding; --json has what the file has, and the verdict."""
     write(tmp_path)
     text, as_json = run(tmp_path), run(tmp_path, '--json')
@@ -303,7 +311,7 @@ def test_without_a_node_the_spool_is_shown(tmp_path: Path) -> None:
     assert 'SHADOWHOUND_HOME' in none.stdout
 
 
-def test_the_robot_of_the_node(tmp_path: Path) -> None:
+def test_status_shows_the_robot_whose_node_runs(tmp_path: Path) -> None:
     """The one that runs, unless one is asked for by option or environment; others that run are named."""
     write(tmp_path, robot='rex', ended=True)
     write(tmp_path, robot='tachi')
@@ -381,7 +389,7 @@ def test_watch_restores_the_terminal(tmp_path: Path) -> None:
     assert text.count('\x1b[?25h') >= text.count('\x1b[?25l') > 0
 
 
-def test_a_topic_that_others_hear_is_not_called_silent() -> None:
+def test_a_topic_that_other_nodes_receive_is_not_called_silent() -> None:
     """Somebody publishes it, as the finding says."""
     row = a_topic(publishers=0, received=0)
     undiscovered = {'/imu': {'text': '/imu is not all heard'}}
@@ -389,3 +397,104 @@ def test_a_topic_that_others_hear_is_not_called_silent() -> None:
     assert '/imu is not all heard' in text
     assert 'Nobody publishes' not in text
     assert 'Nobody publishes /imu' in shown(topics={'/imu': row})
+
+
+NUMBERS = st.integers() | st.floats() | st.sampled_from([0, -1, 2**63, 10**300, 1e308, -1e308, float('inf'), float('nan')])
+TEXTS = st.text(max_size=12) | st.sampled_from(
+    ['\ud800', '\x1b[2J', '2026-11-20', '2026-11-20T12:00:00', '2026-11-20T12:00:00Z', '[red]']
+)
+ANY = st.recursive(st.none() | st.booleans() | NUMBERS | TEXTS, lambda inner: st.lists(inner, max_size=2)
+                   | st.dictionaries(TEXTS, inner, max_size=2), max_leaves=4)  # fmt: skip
+
+
+def of_type(hint: Any) -> st.SearchStrategy[Any]:
+    """Values that a field takes, extreme ones among them, and now and then another one."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in {Union, UnionType}:
+        (kind,) = (each for each in arguments if each is not NoneType)
+        return st.none() | of_type(kind)
+    if is_dataclass(hint):
+        return of_dataclass(hint)
+    if origin is tuple:
+        return st.lists(of_type(arguments[0]), max_size=2)
+    if origin is not None:
+        return st.dictionaries(TEXTS, of_type(arguments[1]), max_size=2)
+    return {str: TEXTS, bool: st.booleans(), int: st.integers(), float: NUMBERS}[hint]
+
+
+def of_dataclass(kind: Any) -> st.SearchStrategy[dict[str, Any]]:
+    hints = get_type_hints(kind)
+    return st.fixed_dictionaries({}, optional={name: of_type(hint) for name, hint in hints.items()})
+
+
+def shown_status(home: Path, *arguments: str, columns: int = 80) -> str:
+    """What the verb prints; an exit code that is not in the table, or a traceback, fails."""
+    ran = CliRunner(env={'SHADOWHOUND_HOME': str(home), 'COLUMNS': str(columns)}).invoke(
+        cli, arguments, standalone_mode=False, catch_exceptions=False
+    )
+    assert ran.return_value in {ExitCode.FINE, ExitCode.FINDING}
+    return ran.output
+
+
+def write_status(home: Path, status: object) -> None:
+    (home / 'spool').mkdir(exist_ok=True)
+    file(home / 'spool', 'thor').write_bytes(json.dumps(status).encode())
+
+
+def running() -> dict[str, Any]:
+    clock = SystemClock.of_this_machine()
+    return {'robot': 'thor', 'pid': os.getpid(), 'boot_id': clock.boot_id, 'boot_ns': clock.boot_ns(), 'version': '1'}
+
+
+FUZZ: Final = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None)
+
+
+@FUZZ
+@given(status=of_dataclass(NodeStatus))
+def test_any_values_of_a_running_node_are_shown(tmp_path: Path, status: dict[str, Any]) -> None:
+    """All fields have the types that they should have, and values that nobody would write."""
+    write_status(tmp_path, {**status, **running()})
+    assert 'thor' in shown_status(tmp_path, 'status')
+    document = json.loads(shown_status(tmp_path, 'status', '--json'))
+    assert document['robot'] == 'thor'
+
+
+@FUZZ
+@given(document=ANY | st.dictionaries(st.sampled_from([*get_type_hints(NodeStatus), 'x']), ANY, max_size=4))
+def test_any_json_document_is_shown_or_an_error(tmp_path: Path, document: Any) -> None:
+    """The file is JSON, and nothing else of it is as it should be."""
+    write_status(tmp_path, {**document, **running()} if isinstance(document, dict) else document)
+    assert 'thor' in shown_status(tmp_path, 'status')
+
+
+@pytest.mark.parametrize(
+    'content', [b'', b'{', b'\xff\xfe', b'[' * 100_000, b'{"uptime_s": 1e999}', b'{"pid": NaN}', b'9' * 5000], ids=range(7)
+)
+def test_a_file_that_is_not_json_is_an_error(tmp_path: Path, content: bytes) -> None:
+    """The error names the file."""
+    write_status(tmp_path, {})
+    file(tmp_path / 'spool', 'thor').write_bytes(content)
+    assert 'status-thor.json cannot be read' in ' '.join(shown_status(tmp_path, 'status', columns=200).split())
+
+
+@pytest.mark.parametrize('started', ['', 'yesterday', '9999-99-99T00:00:00Z', '2026-11-20T12:00:00+25:00', 'Z'])
+def test_a_mission_with_an_invalid_start_is_shown(tmp_path: Path, started: str) -> None:
+    """It is shown, and its start is unknown."""
+    write_status(
+        tmp_path,
+        {**running(), 'time': '2026-11-20T12:00:05Z', 'mission': {'mission_id': 'm1', 'type': 'patrol', 'started': started}},
+    )
+    assert 'patrol, since an unknown time' in ' '.join(shown_status(tmp_path, 'status').split())
+
+
+def test_the_program_ends_without_a_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where a figure is out of any range."""
+    write_status(tmp_path, {**running(), 'uptime_s': 1e308, 'queue': {'messages': 10**30, 'max_messages': 1}})
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'status'])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code in {ExitCode.FINE, ExitCode.FINDING}
+    assert 'Traceback' not in ''.join(capsys.readouterr())

@@ -1,4 +1,7 @@
-"""Whether the clock is set, and when it steps, is seen by the boot clock and said once."""
+"""Whether the clock is set, and when it steps, is seen by the boot clock and said once.
+
+The one rule by which objects, bags and missions of before the clock was set get their date, or go without one.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import pytest
 from clocks import NOON_NS, Clocks
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.core.clock_watch import ClockWatch
+from shadowhound_data_logger.core.clock_watch import ClockWatch, UtcOffsets
 
 
 @pytest.fixture
@@ -28,7 +31,7 @@ def test_a_clock_before_2024_is_not_set(clocks: Clocks) -> None:
     assert watch.offset_ns() == EARLIEST_SANE_NS - clocks.boot_ns()
 
 
-def test_setting_it_is_a_step(clocks: Clocks) -> None:
+def test_setting_the_clock_is_a_step(clocks: Clocks) -> None:
     """It is told without waiting for the next look, and counted by that; only once."""
     watch = ClockWatch(clocks, 600.0)
     clocks.set()
@@ -59,7 +62,7 @@ def test_a_clock_that_is_slewed_does_not_step(clocks: Clocks) -> None:
         assert not watch.poll()
 
 
-def test_it_is_not_waited_for_for_ever(clocks: Clocks) -> None:
+def test_the_clock_is_not_waited_for_indefinitely(clocks: Clocks) -> None:
     """After the time that was set, and only while it is not set; a later setting counts as any."""
     watch = ClockWatch(clocks, 600.0)
     clocks.wait(600)
@@ -104,8 +107,64 @@ def test_each_change_is_logged_once(clocks: Clocks, caplog: pytest.LogCaptureFix
     assert watch.state().steps == 6
 
 
-def test_it_is_a_clock(clocks: Clocks) -> None:
+def test_a_clock_watch_is_a_clock(clocks: Clocks) -> None:
     """Whoever asks for the time gets that of the machine."""
     clocks.set()
     watch = ClockWatch(clocks, 600.0)
     assert (watch.wall_ns(), watch.boot_ns(), watch.boot_id) == (NOON_NS, 60 * SECOND, 'this-boot')
+
+
+HOLD_S = 600.0
+KNOWN_NS = 1234 * SECOND
+
+
+@pytest.fixture
+def offsets(clocks: Clocks) -> UtcOffsets:
+    """It knows one earlier boot, and has an old note of this one."""
+    return UtcOffsets(clocks, HOLD_S, lambda: {'known-boot': KNOWN_NS, 'this-boot': 1})
+
+
+def test_dating_waits_while_the_clock_is_not_set(clocks: Clocks, offsets: UtcOffsets) -> None:
+    """For as long as it may, counted from the beginning; then it goes without a date."""
+    began_ns = clocks.boot_ns()
+    assert offsets.of('this-boot', began_ns) is None
+    clocks.wait(HOLD_S)
+    assert offsets.of('this-boot', began_ns) is None
+    clocks.wait(0.001)
+    assert offsets.of('this-boot', began_ns) == 0
+    assert offsets.of('this-boot', clocks.boot_ns()) is None, 'what begins later waits as long'
+
+
+def test_the_current_clock_dates_objects_of_this_boot(clocks: Clocks, offsets: UtcOffsets) -> None:
+    """Whatever was noted of it, and however long it has waited; a correction counts from then on."""
+    began_ns = clocks.boot_ns()
+    clocks.wait(2 * HOLD_S)
+    clocks.set()
+    assert offsets.of('this-boot', began_ns) == NOON_NS - clocks.boot_ns()
+    clocks.offset_ns += SECOND
+    assert offsets.of('this-boot', began_ns) == NOON_NS - clocks.boot_ns() + SECOND
+
+
+def test_a_clock_that_is_lost_again_dates_nothing(clocks: Clocks, offsets: UtcOffsets) -> None:
+    """It was set, and is back in 1970: what is taken now waits anew."""
+    clocks.set()
+    clocks.wait(2 * HOLD_S)
+    clocks.set(5 * SECOND)
+    assert offsets.of('this-boot', clocks.boot_ns()) is None
+
+
+@pytest.mark.parametrize('is_set', [False, True])
+def test_objects_of_an_earlier_boot_are_not_waited_for(clocks: Clocks, offsets: UtcOffsets, is_set: bool) -> None:
+    """What was noted of its clock dates it; else nobody will ever know. It waits for nothing, whatever the clock shows now."""
+    if is_set:
+        clocks.set()
+    assert offsets.of('known-boot', clocks.boot_ns()) == KNOWN_NS
+    assert offsets.of('other-boot', clocks.boot_ns()) == 0
+
+
+def test_nothing_waits_where_waiting_is_off(clocks: Clocks) -> None:
+    """With a wait of 0 s the next moment is too late."""
+    offsets = UtcOffsets(clocks, 0.0, dict)
+    began_ns = clocks.boot_ns()
+    clocks.wait(0.001)
+    assert offsets.of('this-boot', began_ns) == 0

@@ -1,3 +1,5 @@
+"""Settings from any parameters and any environment: either they are refused by name, or everything they promise works."""
+
 from __future__ import annotations
 
 import re
@@ -7,9 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from profiles import examples
 
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import Settings, default_parameters
 from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.keys import KeyTemplate, check_key, check_name
 from shadowhound_data_logger.core.options import GIBI
 
 
@@ -25,7 +32,7 @@ def refused(**parameters: Any) -> SettingError:
     return caught.value
 
 
-def test_nothing_has_to_be_set() -> None:
+def test_no_setting_is_required() -> None:
     """With nothing set the robot has the name of its host, the store is a folder, and all sensors of the Go2 are logged."""
     settings = load()
     assert settings.robot == re.sub(r'[^A-Za-z0-9_-]', '_', socket.gethostname()).strip('_-')
@@ -53,7 +60,9 @@ def test_the_defaults_can_be_spelled_out() -> None:
     ('odin', {'SHADOWHOUND_ROBOT': 'loki'}, '/tachi', 'odin'), ('', {'SHADOWHOUND_ROBOT': 'loki'}, '/tachi', 'loki'),
     ('', {}, '/tachi', 'tachi'), ('', {'SHADOWHOUND_ROBOT': ''}, '/lab/robot0', 'lab_robot0'),
 ])  # fmt: skip
-def test_the_robot_name(given: str, environ: dict[str, str], namespace: str, robot: str) -> None:
+def test_the_robot_name_comes_from_parameter_environment_or_host(
+    given: str, environ: dict[str, str], namespace: str, robot: str
+) -> None:
     """The parameter comes before the variable, and that before the namespace."""
     assert load(environ, namespace, robot=given).robot == robot
 
@@ -62,7 +71,7 @@ def test_the_robot_name(given: str, environ: dict[str, str], namespace: str, rob
     ('turtle.local', None, 'turtle_local'), ('turtle', 'turtlebot4_msgs', 'turtle'), ('jetson', 'go2_interfaces', 'thor'),
     ('jetson', 'unitree_go', 'thor'), ('---', None, 'robot'),
 ])  # fmt: skip
-def test_a_robot_without_a_name(
+def test_a_robot_without_a_name_gets_the_default(
     host: str, package: str | None, robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is called thor where the messages of a Go2 are installed, and as its host otherwise."""
@@ -73,7 +82,7 @@ def test_a_robot_without_a_name(
 
 
 @pytest.mark.parametrize('value', ['../thor', 'a b', 'x' * 65, 7])
-def test_a_robot_name_that_is_no_word(value: object) -> None:
+def test_an_invalid_robot_name_is_refused(value: object) -> None:
     """A robot name that could not lead a key is refused with itself."""
     assert refused(robot=value).data['value'] == value
 
@@ -133,20 +142,20 @@ def test_a_topic_has_one_sensor() -> None:
     assert 'imu.topics' in str(error)
 
 
-def test_a_sensor_of_ones_own() -> None:
+def test_a_custom_sensor_takes_any_topic() -> None:
     """A sensor that is not a default takes any topic; whole numbers pass where fractions are allowed."""
     (sensor,) = load(sensors=['thermal'], thermal__topics=['thermal/raw'], thermal__rate_hz=2).sensors
     assert (sensor.name, sensor.topics, sensor.rate_hz, sensor.period_ns) == ('thermal', ('thermal/raw',), 2.0, 500_000_000)
 
 
-def test_an_archive_is_of_several_messages() -> None:
+def test_an_archive_needs_a_batch() -> None:
     """A zip or tar of single messages is refused."""
     error = refused(camera__format='zip')
     assert (error.data['name'], error.data['value']) == ('camera.batch_s', 0.0)
     assert load(camera__format='tar', camera__batch_s=1.0).sensors[0].batch_s == 1.0
 
 
-def test_the_least_time_between_two_objects() -> None:
+def test_keys_are_as_fine_as_the_shortest_time_between_two_objects() -> None:
     """Names go by the batch, else by the rate."""
     imu = {'imu__rate_hz': 0.0, 'imu__batch_s': 10.0}
     assert load(**imu).sensors[3].period_ns == 10_000_000_000
@@ -211,7 +220,7 @@ def test_an_endpoint_that_some_client_cannot_use_is_refused(name: str, url: str)
      ({'AWS_ENDPOINT_URL': 'http://all:1', 'AWS_ENDPOINT_URL_S3': ''}, 'http://all:1'),
      ({'AWS_ENDPOINT_URL': '', 'AWS_ENDPOINT_URL_S3': ''}, None)],
 )  # fmt: skip
-def test_which_endpoint_is_used(environ: dict[str, str], expected: str | None) -> None:
+def test_the_endpoint_is_chosen_by_precedence(environ: dict[str, str], expected: str | None) -> None:
     """AWS_ENDPOINT_URL_S3 before AWS_ENDPOINT_URL, as in botocore; slashes at the end do not count, an empty value is none."""
     assert load(environ).store.endpoint_url == expected
 
@@ -240,3 +249,70 @@ def test_a_field_needs_a_topic_and_a_name(given: str) -> None:
     error = refused(mission__battery=given)
     assert (error.data['name'], error.data['value']) == ('mission.battery', given)
     assert load(mission__battery='', mission__temperature='low/state:motor_state.0.temperature')
+
+
+KNOWN = sorted(default_parameters())
+CHOSEN = (
+    '', '~nobody/x', '{robot}/{date}/{time}', '{robot[0]}/{date}/{time}', 'a/../b', '\0', '{robot}/{date!r}/{time:>9999999}',
+    'json', 'camera', '\ud800', 'x' * 5000,
+)  # fmt: skip
+TEXT = st.one_of(st.text(max_size=30), st.sampled_from(CHOSEN))
+NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from([10**400, -(10**400), True, 2**63, -0.0]))
+PLAIN = st.one_of(TEXT, NUMBERS, st.none(), st.binary(max_size=5))
+VALUES = st.one_of(PLAIN, st.lists(PLAIN, max_size=4), st.lists(TEXT, max_size=4), st.dictionaries(TEXT, PLAIN, max_size=2))
+NAMES = st.one_of(
+    st.sampled_from(KNOWN),
+    st.sampled_from(KNOWN).flatmap(lambda name: st.text(max_size=4).map(lambda tail: name + tail)),
+    st.builds('{}.{}'.format, TEXT, st.sampled_from(['topics', 'key', 'rate_hz', ''])),
+    TEXT,
+)
+VARIABLES = ('AWS_ENDPOINT_URL', 'AWS_REGION', 'AWS_SECRET_ACCESS_KEY', 'SHADOWHOUND_HOME', 'SHADOWHOUND_ROBOT')
+
+
+def loaded(parameters: dict[str, Any], environ: dict[str, str], namespace: str = '/') -> Settings | None:
+    """The settings; None where they were refused with the name of what is wrong, in words that can be printed."""
+    try:
+        return Settings.load(parameters, environ, namespace)
+    except SettingError as error:
+        refusal = error
+    assert 'name' in refusal.data
+    assert refusal.data['allowed']
+    assert str(refusal)
+    return None
+
+
+@settings(derandomize=True, deadline=None, max_examples=examples(400))
+@given(st.dictionaries(NAMES, VALUES, max_size=4))
+@example({'camera.rate_hz': 10**400})
+@example({'spool.max_bytes': 10**400})
+@example({'sensors': ['a'], 'a.topics': ['b'], 'a.key': '{robot}/{date}/{time}{sensor.name}'})
+def test_any_accepted_parameters_work(parameters: dict[str, Any]) -> None:
+    """Whatever is accepted names safe keys at any time, and periods that can be counted."""
+    found = loaded(parameters, {})
+    if found is None:
+        return
+    check_name(found.robot, 'the robot')
+    for sensor in found.sensors:
+        assert 0 <= sensor.period_ns <= 10**14
+        for stamp_ns in (0, 1, 2**31 * SECOND, 2**32 * SECOND):
+            key = KeyTemplate(sensor.key).render(robot=found.robot, sensor=sensor.name, stamp_ns=stamp_ns,
+                                                 period_ns=sensor.period_ns, ext='json')  # fmt: skip
+            assert check_key(key).startswith(f'{found.robot}/')
+
+
+@settings(derandomize=True, deadline=None, max_examples=examples(200))
+@given(st.dictionaries(st.sampled_from(VARIABLES), TEXT, max_size=5), TEXT)
+@example({'SHADOWHOUND_HOME': '~nobody-of-this-name/x'}, '/')
+def test_any_accepted_environment_works(environ: dict[str, str], namespace: str) -> None:
+    """What is accepted has an absolute folder and a robot that is a word."""
+    found = loaded({}, environ, namespace)
+    if found is not None:
+        assert found.spool_path.is_absolute()
+        check_name(found.robot, 'the robot')
+
+
+@settings(derandomize=True, deadline=None, max_examples=examples(600))
+@given(name=st.sampled_from(KNOWN), value=VALUES)
+def test_each_parameter_takes_a_value_or_refuses_it_by_name(name: str, value: Any) -> None:
+    """Each parameter that there is takes a value of its kind, or refuses it by its name."""
+    loaded({name: value}, {})

@@ -21,19 +21,19 @@ DEGREE_M = 111_195.08
         ((0.0, 0.0), (0.0, 180.0), 180 * DEGREE_M),
     ],
 )
-def test_distances(one: tuple[float, float], other: tuple[float, float], meters: float) -> None:
+def test_distances_on_earth_are_exact(one: tuple[float, float], other: tuple[float, float], meters: float) -> None:
     """A place is within a little more than its distance, and not within a little less."""
     assert is_within(*one, *other, meters * 1.001 + 0.1)
     assert is_within(*other, *one, meters * 1.001 + 0.1)
     assert meters == 0.0 or not is_within(*one, *other, meters * 0.999 - 0.1)
 
 
-def test_a_radius_beyond_the_antipodes_has_all() -> None:
+def test_a_radius_beyond_the_antipodes_includes_every_place() -> None:
     """Nothing on Earth is further away."""
     assert is_within(-10.0, -170.0, 10.0, 10.0, 1e9)
 
 
-def test_what_is_no_place() -> None:
+def test_an_invalid_position_is_refused() -> None:
     """Degrees beyond the poles, and NaN."""
     assert is_place(-90.0, 180.0)
     assert not any(is_place(*each) for each in ((90.1, 0.0), (0.0, -180.1), (float('nan'), 0.0), (0.0, float('nan'))))

@@ -28,7 +28,7 @@ from shadowhound_data_logger.formats.statistics import NUMBERS
 LOW = 'low_battery: lowstate:bms_state.soc < 20 for 5'
 
 
-def test_a_condition_is_read() -> None:
+def test_a_condition_is_parsed() -> None:
     """Name, topic, field, comparison, threshold and hold time, whatever the blanks."""
     test = Comparison('lowstate:bms_state.soc < 20 for 5', 'lowstate', 'bms_state.soc', '<', 20.0, 5.0)
     assert conditions([LOW]) == (Condition('low_battery', test),)
@@ -41,7 +41,7 @@ def test_a_condition_is_read() -> None:
 @pytest.mark.parametrize(('sign', 'holding'), [
     ('<', {1}), ('<=', {1, 2}), ('>', {3}), ('>=', {2, 3}), ('==', {2}), ('!=', {1, 3}),
 ])  # fmt: skip
-def test_each_comparison(sign: str, holding: set[int]) -> None:
+def test_each_comparison_holds_as_its_sign_states(sign: str, holding: set[int]) -> None:
     """Holds for the numbers that its sign says."""
     (condition,) = conditions([f'x: t:f {sign} 2'])
     assert {value for value in (1, 2, 3) if condition.test.holds(value)} == holding
@@ -71,7 +71,7 @@ def test_an_invalid_expression_aborts_startup(text: str) -> None:
     ('events.max_bytes', {'events.max_bytes': 100}),
     ('events.pre_s', {'events.pre_s': math.nan}),
 ])  # fmt: skip
-def test_what_makes_no_sense_stops_the_start(name: str, given: dict[str, object]) -> None:
+def test_a_senseless_expression_aborts_startup(name: str, given: dict[str, object]) -> None:
     """A name twice, conditions without anything to keep, an event shorter than its end, what is not an expression."""
     with pytest.raises(SettingError) as refused:
         Settings.load(given, {})

@@ -118,7 +118,7 @@ def test_a_pattern_gets_its_time_later(period_ns: int) -> None:
     assert dated(pattern, NOON_NS + SECOND // 4) == at_once
 
 
-def test_a_key_by_the_boot_clock() -> None:
+def test_a_key_by_the_boot_clock_sorts_by_time() -> None:
     """It has no date, sorts by time, and ends as the final one will."""
     key = unsynced('thor', 'a-boot', 'imu', 123 * SECOND + 45_000_000, 'thor/imu/{date}/{time}_imu.tar.gz')
     assert key == 'thor/_unsynced/a-boot/imu/00000123_045_imu.tar.gz'

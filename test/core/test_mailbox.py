@@ -44,7 +44,7 @@ def test_an_entry_is_rejected_or_round_trips(changed: dict[str, Any], want: dict
     'keys',
     [['tachi/camera/20251018/000001_front.jpg'], ['../../../../etc/passwd', '/etc/passwd'], ['tachi/*'], ['*/../index.db']],
 )
-def test_keys_that_the_robot_does_not_keep_bring_nothing(tmp_path: Path, keys: list[str]) -> None:
+def test_keys_that_the_robot_does_not_keep_match_nothing(tmp_path: Path, keys: list[str]) -> None:
     """A key is compared with those of what is kept, and never opened: the request is done, and found nothing."""
     desk = Desk(tmp_path / 'spool')
     desk.keeps(frame(1))

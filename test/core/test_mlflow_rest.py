@@ -56,7 +56,7 @@ def test_a_redirect_is_not_followed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('status', [200, 400, 503])
 @pytest.mark.parametrize('broken', [b'zz\r\n', b'5\r\n{', b'-5\r\n', b''])
-def test_an_answer_that_breaks_off(tmp_path: Path, status: int, broken: bytes) -> None:
+def test_an_incomplete_answer_is_an_error(tmp_path: Path, status: int, broken: bytes) -> None:
     """Is one of ours as well, whether it was to be an error or not."""
     chunked = {'Transfer-Encoding': 'chunked', 'Connection': 'close'}
     with answering(status, broken, chunked) as (url, _), pytest.raises(TrackingError):
@@ -64,7 +64,7 @@ def test_an_answer_that_breaks_off(tmp_path: Path, status: int, broken: bytes) -
 
 
 @pytest.mark.parametrize('body', [b'[' * 200_000, b'[]', b'\xff', b'{"error_code": 5}'])
-def test_an_error_that_is_not_mlflows(tmp_path: Path, body: bytes) -> None:
+def test_an_error_of_another_server_is_reported(tmp_path: Path, body: bytes) -> None:
     """Is one of ours, whatever its body is."""
     with answering(400, body) as (url, _), pytest.raises(TrackingRefused) as refused:
         MlflowRest(url, LOGIN, tmp_path).json('GET', 'runs/get')

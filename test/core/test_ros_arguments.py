@@ -11,7 +11,7 @@ from shadowhound_data_logger.core.ros_arguments import ParametersUnreadable, par
 NAME = 'capture.rmw'
 
 
-def test_the_last_word_counts(tmp_path: Path) -> None:
+def test_the_last_argument_counts(tmp_path: Path) -> None:
     """Files and single parameters in their order; what is before --ros-args or after -- is none of it."""
     file = tmp_path / 'a.yaml'
     file.write_text('/**:\n  ros__parameters: {capture: {rmw: robot}}\n')
@@ -36,7 +36,7 @@ def test_the_last_word_counts(tmp_path: Path) -> None:
         ('/tachi/**', '/other', False), ('/other_node', '', False),
     ],
 )  # fmt: skip
-def test_which_sections_are_ours(section: str, namespace: str, counts: bool, tmp_path: Path) -> None:
+def test_only_sections_of_this_node_apply(section: str, namespace: str, counts: bool, tmp_path: Path) -> None:
     """By the full name of the node, with rcl's wild cards."""
     file = tmp_path / 'a.yaml'
     file.write_text(f'"{section}":\n  ros__parameters:\n    capture.rmw: robot\n')
@@ -44,7 +44,7 @@ def test_which_sections_are_ours(section: str, namespace: str, counts: bool, tmp
     assert parameter(arguments, NAME) == ('robot' if counts else None)
 
 
-def test_namespaces_that_are_keys(tmp_path: Path) -> None:
+def test_namespaces_are_nested_keys(tmp_path: Path) -> None:
     """A namespace may be a key of its own, above the node's; without a name to ask for, every namespace will do."""
     file = tmp_path / 'a.yaml'
     file.write_text('tachi:\n  sensor_logger_node:\n    ros__parameters: {robot: tachi}\nother:\n  ros__parameters: {robot: x}\n')
@@ -53,7 +53,7 @@ def test_namespaces_that_are_keys(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('text', ['sensor_logger_node: {}', 'a: [', '3', 'a: {b: {c: 1}}'])
-def test_what_is_no_parameter_file(text: str, tmp_path: Path) -> None:
+def test_an_invalid_parameter_file_is_refused(text: str, tmp_path: Path) -> None:
     """It says so, and which."""
     file = tmp_path / 'a.yaml'
     file.write_text(text)
@@ -61,7 +61,7 @@ def test_what_is_no_parameter_file(text: str, tmp_path: Path) -> None:
         parameter(['--ros-args', '--params-file', str(file)], NAME)
 
 
-def test_rules_for_one_node_alone() -> None:
+def test_remapping_rules_for_other_nodes_do_not_apply() -> None:
     """Without its name; those for all nodes or for another one are not among them, nor one for a topic of that name."""
     arguments = [
         '-r',

@@ -60,7 +60,7 @@ def test_an_empty_rule_is_no_rule() -> None:
     ('mission and (wifi.ssid == "home" or dock/at:data == 0)', False), ('not (mission and wifi.ssid == "home")', True),
     ('lowstate:bms_state.soc > 30 for 0 s', True), ('lowstate:bms_state.soc>30 for 0s and(mission)', True),
 ])  # fmt: skip
-def test_rules_and_their_results(text: str, holds: bool) -> None:
+def test_rules_have_their_results(text: str, holds: bool) -> None:
     known = Known({'lowstate:bms_state.soc': 42.0, 'dock/at:data': 1.0}, ['lab'], 12 * 60, 'patrol')
     assert evaluate(text, known).holds is holds
 
@@ -81,13 +81,13 @@ def test_a_number_that_is_not_finite_is_unknown() -> None:
     assert evaluate('soc:data < 30', Known({'soc:data': float('nan')})).holds is None
 
 
-def test_why_it_does_not_hold() -> None:
+def test_an_unmet_rule_names_its_reason() -> None:
     known = Known({'lowstate:bms_state.soc': 27.0}, ['cafe'])
     found = evaluate('lowstate:bms_state.soc > 30 and wifi.ssid == "lab" and not mission', known)
     assert found.why == 'lowstate:bms_state.soc > 30: it is 27; wifi.ssid == "lab": it is "cafe"'
 
 
-def test_a_number_has_to_hold_for_its_time() -> None:
+def test_a_number_must_hold_for_its_time() -> None:
     rule, known = read('soc:data > 30 for 5'), Known({'soc:data': 31.0})
     assert [bool(rule.evaluate(known, now).holds) for now in (0.0, 4.9, 5.0)] == [False, False, True]
     known.numbers['soc:data'] = 29.0
@@ -98,7 +98,7 @@ def test_a_number_has_to_hold_for_its_time() -> None:
     assert rule.evaluate(known, 13.0).holds is None
 
 
-def test_every_part_is_judged_even_where_one_decides() -> None:
+def test_every_part_is_evaluated_even_where_one_decides() -> None:
     """Else the time for which a number has to hold would begin when the other part changes."""
     rule, known = read('mission and soc:data > 30 for 5'), Known({'soc:data': 31.0})
     assert not rule.evaluate(known, 0.0).holds
@@ -106,7 +106,7 @@ def test_every_part_is_judged_even_where_one_decides() -> None:
     assert rule.evaluate(known, 5.0).holds
 
 
-def test_topics_are_those_that_it_asks() -> None:
+def test_a_rule_lists_its_topics() -> None:
     assert list(read('a:b > 1 and (not /c/d:e.f < 2 or mission)').topics()) == ['a', '/c/d']
 
 
@@ -128,7 +128,7 @@ def test_an_invalid_rule_names_the_position(text: str, place: str) -> None:
     'time 25:00-26:00', 'time 10:60-11:00', 'time 24:30-01:00', 'a:b > 1 for -1', 'a:b > 1e999', 'not ' * 40 + 'mission',
     '(' * 40 + 'mission' + ')' * 40, 'mission or ' * 1000 + 'mission',
 ])  # fmt: skip
-def test_what_is_out_of_bounds_is_refused(text: str) -> None:
+def test_a_rule_out_of_bounds_is_refused(text: str) -> None:
     with pytest.raises(SettingError):
         read_rule(text, 'upload.when')
 

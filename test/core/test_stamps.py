@@ -65,13 +65,13 @@ def test_a_message_is_dated_by_its_stamp_or_its_arrival(header_ns: int, source_n
     pytest.param(EARLIEST_SANE_NS, NOW_NS, Dated(NOW_NS, 'stamp_too_old'), id='it knows the time, and its stamp is old'),
     pytest.param(NOW_NS + WEEK_NS, NOW_NS, Dated(NOW_NS, 'stamp_ahead'), id='it knows the time, and its stamp is ahead'),
 ])  # fmt: skip
-def test_the_best_time_while_our_clock_is_not_set(header_ns: int, source_ns: int, dated: Dated) -> None:
+def test_while_the_clock_is_not_set_the_best_available_time_is_used(header_ns: int, source_ns: int, dated: Dated) -> None:
     """UTC by another machine that knows it; otherwise the boot clock's time, that of the sending where it can be known."""
     clocks = Clocks()
     assert StampRule(clocks).date(header_ns, source_ns, clocks.wall_ns()) == dated
 
 
-def test_the_bound_can_be_raised() -> None:
+def test_the_maximum_offset_can_be_raised() -> None:
     """Whoever replays the bags of a year keeps their stamps, and still trusts none beyond it."""
     rule = StampRule(Clocks(), 365 * DAY_NS)
     assert rule.date(NOW_NS - 364 * DAY_NS, NOW_NS, NOW_NS) == Dated(NOW_NS - 364 * DAY_NS)
@@ -136,7 +136,7 @@ def test_erratic_stamps_are_dated_by_arrival(offset: Callable[[], int]) -> None:
     assert track.state == 'stable'
 
 
-def test_messages_that_a_queue_held_up_keep_their_stamps() -> None:
+def test_messages_delayed_by_a_queue_keep_their_stamps() -> None:
     """Ten seconds without any, then all of them at twice the rate, in order."""
     track = new_track()
     follow(track, [5 * MS] * 60)
@@ -189,7 +189,7 @@ def test_the_state_has_its_beginning() -> None:
     assert (track.spread_ns, track.sent_offset_ns) == (0, 2 * MS)
 
 
-def test_sim_time_is_reported_as_what_it_is() -> None:
+def test_sim_time_is_reported_as_such() -> None:
     """A stamp before 2024 is refused by the bound, and named as the state."""
     track = new_track()
     assert track.date(70 * SECOND, NOW_NS, NOW_NS) == Dated(NOW_NS, 'stamp_before_2024')
@@ -221,7 +221,7 @@ def test_the_likely_cause_is_reported(stamp_s: float, sent_s: float, state: str,
     assert describe(report).startswith('stamps are ')
 
 
-def test_nothing_is_reported_of_stable_and_of_latched_stamps() -> None:
+def test_stable_and_latched_stamps_are_not_reported() -> None:
     """A message that was sent an hour ago says nothing about a clock; nor does a publisher that is silent now."""
     clocks = Clocks()
     clocks.set(NOW_NS)

@@ -31,7 +31,7 @@ T0 = 1_760_788_800 * SECOND
         (datetime(2026, 10, 28, 14, tzinfo=timezone(timedelta(hours=2))), NOON_NS),
     ],
 )  # fmt: skip
-def test_times_in_words(text: str | datetime, ns: int) -> None:
+def test_times_are_read_in_words(text: str | datetime, ns: int) -> None:
     """UTC unless a zone is named; a date is its beginning."""
     assert moment('since', text, NOON_NS) == ns
 
@@ -40,7 +40,7 @@ def test_times_in_words(text: str | datetime, ns: int) -> None:
     'text', ['', 'tomorrow', '2 fortnights', '2026-13-01', '2026-10-28T25:00', '2026-1028', '-2h', '9e999d', 'h', '900000d',
              '999999999999w'],
 )  # fmt: skip
-def test_what_is_no_time_is_refused_by_name(text: str) -> None:
+def test_an_invalid_time_is_refused_by_name(text: str) -> None:
     """The error names the flag, the value and what is allowed."""
     with pytest.raises(SettingError, match='until') as caught:
         moment('until', text, NOON_NS)
@@ -54,7 +54,7 @@ def test_what_is_no_time_is_refused_by_name(text: str) -> None:
     ('2025-10-18T14:00:00.123456789+02:00', T0 + 123_456_789), ('2025-10-18T07:00:00-0500', T0),
     ('1760788801', T0 + SECOND), ('1760788801.5', T0 + 1_500_000_000), (str(T0 + 7), T0 + 7),
 ])  # fmt: skip
-def test_a_time_in_a_bag(text: str, wanted: int) -> None:
+def test_a_time_in_a_bag_is_read_in_any_form(text: str, wanted: int) -> None:
     """In any of the forms, to the nanosecond."""
     assert moment_in_bag('--start', text, T0, T0 + 10 * SECOND) == wanted
 
@@ -62,21 +62,21 @@ def test_a_time_in_a_bag(text: str, wanted: int) -> None:
 @pytest.mark.parametrize(
     'text', ['', 'x', '12:00', '2025-13-01', '2025-10-18T25:00', '1e3', 'nan', '--1', '2025-10-18T12:00:00 ', 'yesterday']
 )
-def test_what_is_no_time_in_a_bag_is_refused(text: str) -> None:
+def test_an_invalid_time_in_a_bag_is_refused(text: str) -> None:
     """With the option's name."""
     with pytest.raises(SettingError, match='--start'):
         moment_in_bag('--start', text, T0, T0)
 
 
 @given(st.datetimes(min_value=datetime(1, 1, 2), max_value=datetime(9999, 12, 30)), st.integers(-14 * 60, 14 * 60))  # noqa: DTZ001
-def test_what_python_writes_is_read(time: datetime, minutes: int) -> None:
+def test_times_that_python_writes_are_read(time: datetime, minutes: int) -> None:
     """``isoformat`` of any time in any zone, and the same time as an object."""
     zoned = time.replace(tzinfo=timezone(timedelta(minutes=minutes)))
     assert moment('since', zoned.isoformat(), NOON_NS) == moment('since', zoned, NOON_NS)
 
 
 @pytest.mark.long('a process for each')
-def test_gnu_date_agrees() -> None:
+def test_times_agree_with_gnu_date() -> None:
     """On what both read."""
     for text in ('2026-10-28T14:00:00+02:00', '2025-02-28 23:59:59', '20240229', '1969-12-31T23:59:59Z'):
         told = subprocess.run(['date', '-u', '-d', text, '+%s'], capture_output=True, text=True, check=True)

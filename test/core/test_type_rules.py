@@ -40,18 +40,18 @@ def test_latched_topics_are_kept_when_they_change() -> None:
     ('/scan', (), 'scan'), ('/robot0/front/scan', (), 'robot0_front_scan'), ('/imu', ('imu',), 'imu_2'),
     ('/imu', ('imu', 'imu_2'), 'imu_3'), ('/capture', (), 'capture_2'), ('/robot', (), 'robot_2'), ('/spool', (), 'spool_2'),
 ])  # fmt: skip
-def test_names(topic: str, taken: tuple[str, ...], name: str) -> None:
+def test_topics_get_sensor_names(topic: str, taken: tuple[str, ...], name: str) -> None:
     """That of the topic, unless another sensor or group of settings has it."""
     sensor = sensor_for(topic, 'std_msgs/msg/Bool', taken, is_latched=False)
     assert sensor is not None
     assert (sensor.name, sensor.topics) == (name, (topic,))
 
 
-def test_a_type_without_a_rule() -> None:
+def test_a_type_without_a_rule_is_recorded_as_serialized() -> None:
     assert sensor_for('/led', 'std_msgs/msg/ColorRGBA', (), is_latched=False) is None
 
 
-def test_which_types_a_unitree_has() -> None:
+def test_the_types_of_a_unitree_are_known() -> None:
     assert is_of_unitree('unitree_go/msg/LowState')
     assert is_of_unitree('go2_interfaces/msg/IMU')
     assert not is_of_unitree('sensor_msgs/msg/Imu')

@@ -1,18 +1,54 @@
-"""CSV files from spreadsheets: with a byte order mark, in UTF-16, or with other separators, in every reader that there is."""
+"""CSV files from spreadsheets: with a byte order mark, in UTF-16, or with other separators, in every reader that there is.
+
+Documents whose lists and objects lie in one another more often than Python's stack is deep.
+
+No key, name of a file or bucket that a robot wrote leads out of the folder that is read or written.
+"""
 
 from __future__ import annotations
 
+import json
+import tarfile
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from bags.real_bags import NAME, put_item, stored, write_ours
+from lake import bad_parts
+from lake.making import NOON_NS as ROW_NOON_NS
+from lake.making import add_part, folder_store, row
+from stores.memory import MemoryStore
 
-from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger import lake
+from shadowhound_data_logger.bags.fetch import fetch
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, find_bag
+from shadowhound_data_logger.bags.verify import verify_folder
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import (
+    BagDamaged,
+    DataLoggerError,
+    LakeError,
+    NameRefused,
+    ObjectRefused,
+    SettingError,
+    StoreError,
+)
+from shadowhound_data_logger.core.mailbox import RequestRefused, decode_inbox
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.core.untrusted import MAX_JSON_DEPTH, from_json, from_strict_json, path_below
 from shadowhound_data_logger.datasets import clocks, imports
+from shadowhound_data_logger.datasets.transfer import _digests
+from shadowhound_data_logger.formats.rows import catalog, parts
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.decode import members, records
 from shadowhound_data_logger.lake.labels import from_csv
+from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.missions.pictures import read_path
+from shadowhound_data_logger.stores import open_store
 
 NOON_NS = 1_793_188_800_000_000_000
 READERS: dict[str, tuple[str, Callable[[Path], Any], Any]] = {
@@ -57,7 +93,7 @@ def test_other_separators_are_named(tmp_path: Path, reader: str, separator: str,
 
 @pytest.mark.parametrize('body', [b'\xff\xfe\x00', b'\xff\xff\xff', b'a,b\n"', b'\xef\xbb\xbf', b''])
 @pytest.mark.parametrize('reader', ['--times', '--clock', 'labels'])
-def test_what_is_no_text_is_refused_or_empty(tmp_path: Path, reader: str, body: bytes) -> None:
+def test_files_that_are_not_text_are_refused_or_empty(tmp_path: Path, reader: str, body: bytes) -> None:
     """Nothing but the reader's own error leaves it."""
     path = tmp_path / 'a.csv'
     path.write_bytes(body)
@@ -65,3 +101,181 @@ def test_what_is_no_text_is_refused_or_empty(tmp_path: Path, reader: str, body: 
     with suppress(SettingError, LakeError):
         found = READERS[reader][1](path)
     assert len(found) == 0
+
+
+DEPTHS = (MAX_JSON_DEPTH + 1, 500, 990, 1000, 5000, 200_000)
+
+
+def lists(depth: int) -> bytes:
+    return b'[' * depth + b']' * depth
+
+
+def objects(depth: int) -> bytes:
+    return b'{"a":' * depth + b'1' + b'}' * depth
+
+
+@pytest.mark.parametrize('depth', DEPTHS)
+@pytest.mark.parametrize('made', [lists, objects])
+@pytest.mark.parametrize('read', [from_json, lambda body: from_strict_json(body, 1 << 24)])
+def test_a_document_that_is_too_deep_is_refused(read: Callable[[bytes], Any], made: Callable[[int], bytes], depth: int) -> None:
+    """With a sentence, however deep it is: no reader goes into it by recursion then."""
+    with pytest.raises(ValueError, match='nested deeper than 64'):
+        read(made(depth))
+
+
+def test_reasonably_nested_documents_are_read() -> None:
+    """A document with as much nesting as is allowed, and one that is wide."""
+    for body in (
+        lists(MAX_JSON_DEPTH),
+        objects(MAX_JSON_DEPTH),
+        json.dumps([{'a': [n]} for n in range(10_000)]).encode(),
+        b'1',
+    ):
+        assert from_json(body) == from_strict_json(body, 1 << 24) == json.loads(body)
+
+
+@pytest.mark.parametrize('depth', [500, 1000, 200_000])
+def test_samples_that_are_too_deep_are_no_samples(depth: int) -> None:
+    """Of a robot's batch, of its single documents, and beside the messages of an archive; the error is the one of bad content."""
+    sample = b'{"stamp_ns":1,"a":%b}' % objects(depth)
+    for body in (sample, b'{"type":"x/msg/Y","samples":[%b]}' % sample):
+        with pytest.raises(LakeError, match="not a sensor's JSON"):
+            records(body)
+    with pytest.raises(LakeError, match='the tar cannot be read'):
+        members(tar_of(a_json=sample, a_bin=b'1'), 'tar')
+
+
+@pytest.mark.parametrize('depth', [500, 200_000])
+def test_deep_documents_are_refused_like_other_invalid_ones(depth: int) -> None:
+    """The digests of a data set, and a robot's mailbox."""
+    for read in (_digests, decode_inbox):
+        with pytest.raises((DataLoggerError, RequestRefused)):
+            read(b'{"format":1,"entries":%b}' % lists(depth))
+
+
+def tar_of(**files: bytes) -> bytes:
+    packed = BytesIO()
+    with tarfile.open(fileobj=packed, mode='w') as archive:
+        for name, body in files.items():
+            member = tarfile.TarInfo(name.replace('_', '.'))
+            member.size = len(body)
+            archive.addfile(member, BytesIO(body))
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize('kind', [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE])
+def test_links_and_devices_in_an_archive_are_ignored(tmp_path: Path, kind: bytes) -> None:
+    """What an archive names beside its own bytes is not opened, wherever it points; its messages are read."""
+    secret = tmp_path / 'secret.jpg'
+    secret.write_bytes(b'the key')
+    packed = BytesIO()
+    with tarfile.open(fileobj=packed, mode='w') as archive:
+        for name, target in (('b.jpg', str(secret)), ('../c.jpg', '../secret.jpg'), ('d.jpg', 'a.jpg')):
+            member = tarfile.TarInfo(name)
+            member.type, member.linkname = kind, target
+            archive.addfile(member)
+        for name, body in (('a.jpg', b'picture'), ('a.json', b'{"stamp_ns":1}')):
+            member = tarfile.TarInfo(name)
+            member.size = len(body)
+            archive.addfile(member, BytesIO(body))
+    found = members(packed.getvalue(), 'tar')
+    assert [each.body for each in found] == [b'picture']
+
+
+OUT = ['../secret.jpg', '/etc/passwd', 'a/../../secret.jpg', 'a//b', 'a/./b', '', '.', '..', 'a/', '/', 'a\0b', 'a\x1bb', 'a\nb',
+       'x' * 256, 'a/' * 600, '\ud800']  # fmt: skip
+IN = ['a', 'thor/camera/20261028/120000_front.jpg', 'ä/b c', '...', '.a', 'a..b', '~', '\u202e']
+
+
+@pytest.mark.parametrize('key', OUT)
+def test_a_key_that_is_not_a_path_is_refused(tmp_path: Path, key: str) -> None:
+    with pytest.raises(NameRefused):
+        path_below(tmp_path, key)
+
+
+@pytest.mark.parametrize('key', IN)
+def test_a_path_is_below_its_folder(tmp_path: Path, key: str) -> None:
+    assert path_below(tmp_path, key).resolve().is_relative_to(tmp_path)
+
+
+@pytest.mark.parametrize('key', ['thor/../../../secret.jpg', 'thor/../../secret.jpg', 'thor//secret.jpg'])
+@pytest.mark.parametrize('is_fetched', [True, False])
+def test_a_dataset_reads_nothing_outside_its_folder(tmp_path: Path, key: str, is_fetched: bool) -> None:
+    """A row whose key leads to a file of this machine: of a store in a folder, and of a folder of fetched objects."""
+    (tmp_path / 'secret.jpg').write_bytes(b'secret')
+    root = tmp_path / 'store' / catalog.BUCKET
+    (root / 'thor').mkdir(parents=True)
+    (root / 'secret.jpg').write_bytes(b'secret')
+    told = {**row('camera', ROW_NOON_NS), 'key': key, 'sha256': None, 'bytes': 6}
+    bad_parts.put(folder_store(tmp_path), parts.encode([told]))
+    frames = lake.MissionDataset(root if is_fetched else Bucket(folder_store(tmp_path), catalog.BUCKET))
+    assert len(frames) == 1
+    with pytest.raises((StoreError, LakeError), match='not a path'):
+        frames[0]
+
+
+def test_contents_are_read_from_no_other_folder(tmp_path: Path) -> None:
+    """A bucket is a name; a place reads no more than it is told that there is."""
+    (tmp_path / 'secret').write_bytes(b'secret')
+    (tmp_path / 'store' / 'b').mkdir(parents=True)
+    (tmp_path / 'store' / 'b' / 'k').write_bytes(b'content')
+    place = Place(StoreSettings(directory=tmp_path / 'store'))
+    assert place.read('b', 'k', 7) == b'content'
+    for bucket, key in (('..', 'secret'), ('b', '../../secret'), ('b/..', 'k'), ('', 'k')):
+        with pytest.raises(ObjectRefused):
+            place.read(bucket, key, 100)
+    with pytest.raises(ObjectRefused, match='more than 6 bytes'):
+        place.read('b', 'k', 6)
+
+
+def test_a_source_reads_nothing_outside_its_bucket(tmp_path: Path) -> None:
+    """Neither of its objects' contents nor what is said beside them: a run's id is part of a key."""
+    settings = folder_store(tmp_path)
+    outside = tmp_path / 'secret' / 'summary.json'
+    outside.parent.mkdir()
+    outside.write_text(json.dumps({'result': 'STOLEN'}), encoding='utf-8')
+    run_id = '../../../../secret'
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, [{**row('camera', ROW_NOON_NS), 'mission_id': 'm', 'run_id': run_id}], 'a', tmp_path / 'tmp')
+    (settings.directory / catalog.BUCKET / 'thor' / 'missions').mkdir()
+    source = Bucket(settings, catalog.BUCKET)
+    assert lake.missions(source).to_pydict()['result'] == [None]
+    key = f'thor/missions/{run_id}/summary.json'
+    for ask in (lambda: source.get(key, 100), lambda: source.head(key),
+                lambda: source.ranges(key, [(0, 5)]), lambda: source.delete(key), lambda: source.folders('../'),
+                lambda: list(source.list('../../'))):  # fmt: skip
+        with pytest.raises(ObjectRefused):
+            ask()
+    assert outside.exists()
+
+
+@pytest.mark.parametrize('name', ['../evil.mcap', '/tmp/evil.mcap', 'a/../../evil.mcap', '..'])  # noqa: S108 - a name to be refused
+def test_a_bag_is_fetched_into_its_folder_alone(tmp_path: Path, name: str) -> None:
+    """Neither the name of a file nor that of the bag leads elsewhere; what was refused is not written."""
+    store, to = MemoryStore(), tmp_path / 'to'
+    body = tmp_path / 'body'
+    body.write_bytes(b'evil')
+    store.put(put_item(body, 'thor/rosbags/bag/file', 'bag', 0))
+    before = sorted(tmp_path.rglob('*'))
+    for bag in (RemoteBag('thor', 'bag', (RemoteFile(name, 'thor/rosbags/bag/file', 4),)),
+                RemoteBag('thor', name, (RemoteFile('f.mcap', 'thor/rosbags/bag/file', 4),))):  # fmt: skip
+        with pytest.raises(NameRefused):
+            fetch(store, bag, to)
+    assert sorted(path for path in tmp_path.rglob('*') if path != to and path != to / 'bag') == before
+
+
+def test_a_manifest_names_files_of_its_bag_alone(tmp_path: Path) -> None:
+    """Another file is never opened to be compared with what the manifest says of it."""
+    write_ours(tmp_path / NAME, slices=1)
+    path = tmp_path / NAME / 'manifest.json'
+    told = json.loads(path.read_bytes())
+    told['slices'][0]['file'] = '../secret'
+    with pytest.raises(BagDamaged, match='the name of a file'):
+        Manifest.from_json(json.dumps(told).encode())
+    path.write_text(json.dumps(told), encoding='utf-8')
+    found = verify_folder(tmp_path / NAME)
+    assert [check.name for check in found.findings] == ['manifest.json']
+    store = MemoryStore()
+    stored(store, tmp_path / NAME)
+    with pytest.raises(BagDamaged):
+        fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'to')

@@ -26,7 +26,7 @@ def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_module, 'FIRST_PAUSE_S', 0.001)
 
 
-def test_it_goes_round_until_it_is_stopped() -> None:
+def test_a_worker_repeats_until_it_is_stopped() -> None:
     """The current round is the last one after stop."""
     rounds = threading.Semaphore(0)
     worker = Worker('rounds', rounds.release)
@@ -40,7 +40,7 @@ def test_it_goes_round_until_it_is_stopped() -> None:
     assert (worker.failures, worker.failing) == (0, False)
 
 
-def test_the_system_knows_the_name() -> None:
+def test_the_operating_system_has_the_name_of_a_thread() -> None:
     """As ``top -H`` shows it, cut to what Linux takes."""
     names: list[str] = []
     worker = Worker('a-thread-with-a-long-name', lambda: names.append(worker_module.SYSTEM_NAME.read_text(encoding='utf-8')))
@@ -51,7 +51,7 @@ def test_the_system_knows_the_name() -> None:
     assert names[0] == 'a-thread-with-a\n'
 
 
-def test_a_system_that_keeps_no_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_runs_where_threads_cannot_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is no failure."""
     monkeypatch.setattr(worker_module, 'SYSTEM_NAME', tmp_path / 'none' / 'comm')
     rounds = threading.Semaphore(0)
@@ -123,7 +123,7 @@ def test_a_hanging_round_is_reported() -> None:
 
 
 @pytest.mark.parametrize('death', [SystemExit(1), KeyboardInterrupt(), GeneratorExit(), MemoryError('no room')])
-def test_nothing_a_round_raises_ends_the_thread(death: BaseException) -> None:
+def test_no_exception_ends_the_thread(death: BaseException) -> None:
     """Not even what is meant to end a program: it is counted as any failure, and the next round comes."""
     deaths, well = [death], threading.Event()
 
@@ -170,7 +170,7 @@ def test_a_thread_that_ends_is_started_again(monkeypatch: pytest.MonkeyPatch, ca
     assert worker.join(60)
 
 
-def test_a_system_that_gives_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_that_cannot_be_started_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the start, or later: that is a death like any other, and over when there is one again."""
     well = threading.Event()
     worker = Worker('starved', well.set)
@@ -185,7 +185,7 @@ def test_a_system_that_gives_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     assert worker.join(60)
 
 
-def test_looking_at_one_that_is_not_wanted_starts_nothing() -> None:
+def test_checking_a_stopped_worker_starts_nothing() -> None:
     """Neither before its start nor after its stop."""
     worker = Worker('idle', lambda: None)
     worker.poll()
@@ -232,13 +232,13 @@ def _raise(error: BaseException) -> None:
     raise error
 
 
-def test_one_that_fails_again_and_again_may_be_tried_rarely() -> None:
+def test_a_worker_that_keeps_failing_is_tried_less_often() -> None:
     """The pause doubles up to its own longest one."""
     worker = Worker('rare', lambda: None, longest_pause_s=0.003)
     assert [worker._next_pause() for _ in range(4)] == [0.001, 0.002, 0.003, 0.003]
 
 
-def test_who_looks_while_it_starts_sees_no_death(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_starting_worker_is_not_reported_as_dead(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is started by another thread than the one that supervises it."""
     start = threading.Thread.start
     worker = Worker('worker', lambda: time.sleep(0.01))

@@ -27,7 +27,7 @@ print(unpacked('zstd', zstd.compress(b'a chunk')))
 
 
 @pytest.mark.long('a process of its own')
-def test_nothing_but_the_interpreter_is_needed_from_3_14_on() -> None:
+def test_from_python_3_14_on_only_the_standard_library_is_needed() -> None:
     """Every module of mcap and bags is imported by an interpreter that says it is 3.14, without the package of before."""
     ran = subprocess.run([sys.executable, '-c', PROGRAM], capture_output=True, text=True, check=False, timeout=120)
     assert (ran.returncode, ran.stdout) == (0, "b'a chunk'\n"), ran.stderr

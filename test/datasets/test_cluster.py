@@ -14,7 +14,7 @@ from typing import Final
 
 import pytest
 from datasets.recorded import House, Mission
-from datasets.test_killed import contents
+from datasets.test_export import contents
 
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.lake.training import INFO
@@ -28,8 +28,6 @@ SHORT: Final = TemporaryDirectory(prefix='ray', ignore_cleanup_errors=True)
 """Ray's sockets need a short path."""
 BUILDS: Final = b'ray::Builder.build'
 """The title of a worker while it makes an episode."""
-
-
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.long('starts Ray'),

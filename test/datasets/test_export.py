@@ -1,4 +1,7 @@
-"""A dataset has what each mission recorded, as it was known at each tick, and says what is missing and where it came from."""
+"""A dataset has what each mission recorded, as it was known at each tick, and says what is missing and where it came from.
+
+Killed anywhere and run again, an export and a drop give the files that they would have given.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,9 @@ import json
 import math
 import os
 import platform
+import signal
 import socket
+import subprocess
 import sys
 from contextlib import closing
 from dataclasses import replace
@@ -17,7 +22,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
-from datasets.recorded import House, Mission, lost, video_frames, x_of
+from datasets.recorded import House, Mission, kill_this_process, lost, video_frames, x_of
 from PIL import Image, ImageColor
 
 from shadowhound_data_logger.cli import export as verb
@@ -35,7 +40,7 @@ from shadowhound_data_logger.datasets.video import VideoWriter, frames_at
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.labels import Label
-from shadowhound_data_logger.lake.training import LABEL_TABLE, digest_of
+from shadowhound_data_logger.lake.training import INFO, LABEL_TABLE, digest_of
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
@@ -73,7 +78,7 @@ def exported(house: House) -> Exported:
     return export(house.folder / 'set', house.source, PATROLS, options)
 
 
-def test_a_mission_is_an_episode_once_it_is_known_what_is_missing(exported: Exported) -> None:
+def test_a_mission_becomes_an_episode_once_its_gaps_are_known(exported: Exported) -> None:
     """The one of which the robot has not told all waits, and says for what."""
     assert [each['mission_id'] for each in exported.added] == ['whole', 'gappy']
     assert list(exported.waiting) == ['fresh']
@@ -217,7 +222,7 @@ def test_it_does_not_wait_for_gaps_that_cannot_be_reported(tmp_path: Path) -> No
     assert [each['mission_id'] for each in found.added] == ['blind']
 
 
-def test_causes_that_no_gap_states(tmp_path: Path) -> None:
+def test_stale_ticks_without_a_gap_have_a_cause(tmp_path: Path) -> None:
     """What the settings left out was not sampled; where the robot has told nothing, nobody knows."""
     place = House(tmp_path)
     thin = Mission('thin', seconds=2, sensors=('camera', 'odom'), skipped=7)
@@ -236,7 +241,7 @@ def test_causes_that_no_gap_states(tmp_path: Path) -> None:
         assert json.loads(row[f'{OURS}state.pose/causes']) == {cause: int(stale[:, 1].sum())}
 
 
-def test_numbers_between_two_messages(house: House, tmp_path: Path) -> None:
+def test_values_are_interpolated_between_two_messages(house: House, tmp_path: Path) -> None:
     """With linear, one period late: exactly where the robot was then, and its quaternion as long as it has to be."""
     options = ExportOptions(resample={'odom': 'linear'}, validation=0.5)
     export(tmp_path / 'set', house.source, {'mission': 'whole'}, options)
@@ -387,7 +392,7 @@ def test_frames_in_the_video_are_the_rows(exported: Exported) -> None:
         assert times == pytest.approx(np.arange(row['length']) / 10, abs=1e-9)
 
 
-def test_it_is_proved(house: House, exported: Exported) -> None:
+def test_an_export_passes_verification(house: House, exported: Exported) -> None:
     """And what is changed afterwards, here or in the store, is found."""
     store = DirectoryStore(house.settings.directory)
     store.open()
@@ -397,7 +402,7 @@ def test_it_is_proved(house: House, exported: Exported) -> None:
     assert found.frames == sum(row['length'] for row in Lerobot(exported.folder).rows)
 
 
-def test_what_was_changed_is_found(house: House, tmp_path: Path) -> None:
+def test_verification_finds_changes(house: House, tmp_path: Path) -> None:
     """A byte of a file, and an object that is not what it was."""
     place = House(tmp_path)
     place.record(Mission('only', seconds=2, sensors=('camera', 'odom')))
@@ -436,12 +441,7 @@ def test_two_workers_write_what_one_writes(house: House, exported: Exported, tmp
     assert contents(tmp_path / 'set') == contents(exported.folder)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for part in ('data', 'meta', 'videos')
-            for path in sorted((folder / part).rglob('*')) if path.is_file()}  # fmt: skip
-
-
-def test_the_picture_has_stale_ticks_in_red(exported: Exported) -> None:
+def test_the_report_shows_stale_ticks_in_red(exported: Exported) -> None:
     """On a line of time for each stream of each episode, and nowhere else on it."""
     made, picture = Lerobot(exported.folder), Image.open(exported.folder / 'meta/report.png').convert('RGB')
     assert picture.size == (report.WIDTH, len(made.rows) * (report.HEIGHT + report.GAP) + report.GAP)
@@ -505,7 +505,7 @@ def test_commands_are_the_action_where_they_were_logged(tmp_path: Path) -> None:
     assert found.refused == {'silent': 'the store has no data of cmd_vel in it'}
 
 
-def test_other_settings_are_another_data_set(house: House, exported: Exported, tmp_path: Path) -> None:
+def test_other_settings_need_another_dataset(house: House, exported: Exported, tmp_path: Path) -> None:
     """What it was created with holds for all of it; what no source has is refused, and what is there is told."""
     with pytest.raises(LakeError, match='was created with codec av1'):
         export(exported.folder, house.source, PATROLS, ExportOptions(state=('pose', 'imu', 'joints'), codec='h264'))
@@ -539,7 +539,7 @@ def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Pat
     assert verify(tmp_path / 'set', store).wrong == []
 
 
-def test_a_data_set_goes_to_the_store_and_back(house: House, exported: Exported, tmp_path: Path) -> None:
+def test_a_dataset_is_uploaded_and_fetched_unchanged(house: House, exported: Exported, tmp_path: Path) -> None:
     """Verified, twice without moving anything, and an object tells where it went."""
     store = DirectoryStore(house.settings.directory)
     store.open()
@@ -573,7 +573,7 @@ def test_lerobot_doctor_finds_nothing_wrong(exported: Exported) -> None:
     ] == []
 
 
-def test_a_video_is_no_real_time_process(tmp_path: Path) -> None:
+def test_videos_are_encoded_without_real_time_limits(tmp_path: Path) -> None:
     """Where root writes it, SVT-AV1 would have its way before everything else on the machine; elsewhere it may not."""
     before = os.sched_getscheduler(0)
     with VideoWriter(tmp_path / 'a.mp4', 10, (64, 64), AV1) as video:
@@ -620,3 +620,127 @@ def test_a_worker_with_other_libraries_is_refused(tmp_path: Path) -> None:
     wanted = {**cluster.library_versions(), 'av': '1.0', 'architecture': 'riscv64'}
     with pytest.raises(LakeError, match=rf'has architecture {platform.machine()} instead of riscv64, av .* instead of 1\.0'):
         cluster.Builder().build((), wanted)  # type: ignore[arg-type]
+
+
+DYING = """
+import os, signal, sys
+from pathlib import Path
+from shadowhound_data_logger.formats.rows.catalog import BUCKET
+from shadowhound_data_logger.datasets.export import export
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.core.options import StoreSettings
+
+folder, store, at, real, done = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), os.replace, 0
+def replace(*arguments, **more):
+    global done
+    done += 1
+    if done == at:
+        os.kill(os.getpid(), signal.SIGKILL)
+    real(*arguments, **more)
+os.replace = replace
+export(folder, Bucket(StoreSettings(directory=store), BUCKET), {'mission_type': 'patrol'}, ExportOptions())
+"""
+
+
+class Killed(BaseException):
+    """What no handler expects: as little happens afterwards as after a kill."""
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for part in ('data', 'meta', 'videos')
+            for path in sorted((folder / part).rglob('*')) if path.is_file() and path.suffix != '.part'}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def two_missions(tmp_path_factory: pytest.TempPathFactory) -> House:
+    made = House(tmp_path_factory.mktemp('house'))
+    for number in range(2):
+        made.record(Mission(f'm{number}', begin_s=100 * number, seconds=2, sensors=('camera', 'odom')))
+    return made
+
+
+def dying(patch: pytest.MonkeyPatch, at: int) -> None:
+    """The process dies when it gives a file its name for the ``at``-th time."""
+    real, done = os.replace, 0
+
+    def replace(*arguments: Any, **more: Any) -> None:
+        nonlocal done
+        done += 1
+        if done == at:
+            raise Killed
+        real(*arguments, **more)
+
+    patch.setattr(os, 'replace', replace)
+
+
+@pytest.mark.long('an export for each file that it writes')
+def test_a_killed_export_resumes(two_missions: House, tmp_path: Path) -> None:
+    """At every file that it writes: of an episode, of the dataset, the last one."""
+    export(tmp_path / 'whole', two_missions.source, PATROLS, ExportOptions())
+    wanted = contents(tmp_path / 'whole')
+    for at in range(1, 100):
+        folder = tmp_path / f'set{at}'
+        with pytest.MonkeyPatch.context() as patch:
+            dying(patch, at)
+            try:
+                export(folder, two_missions.source, PATROLS, ExportOptions())
+            except Killed:
+                pass
+            else:
+                break
+        export(folder, two_missions.source, PATROLS, ExportOptions())
+        assert contents(folder) == wanted, at
+    assert at > 15
+
+
+@pytest.mark.long('an export for each file that it writes')
+def test_after_a_kill_another_process_continues_the_export(two_missions: House, tmp_path: Path) -> None:
+    """With SIGKILL, in an episode and while the dataset is written: another process goes on."""
+    export(tmp_path / 'whole', two_missions.source, PATROLS, ExportOptions())
+    wanted = contents(tmp_path / 'whole')
+    for at in (1, 4, 12):
+        folder = tmp_path / f'set{at}'
+        arguments = [sys.executable, '-c', DYING, str(folder), str(two_missions.settings.directory), str(at)]
+        environ = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}
+        assert subprocess.run(arguments, env=environ, check=False, timeout=120).returncode == -signal.SIGKILL
+        export(folder, two_missions.source, PATROLS, ExportOptions())
+        assert contents(folder) == wanted, at
+
+
+@pytest.mark.long('an export for each file that it writes')
+def test_a_killed_worker_is_reported(two_missions: House, tmp_path: Path) -> None:
+    """Nothing was added then; the next run gives the same files."""
+    export(tmp_path / 'whole', two_missions.source, PATROLS, ExportOptions())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('shadowhound_data_logger.datasets.export.build', kill_this_process)
+        with pytest.raises(LakeError, match='a process was killed while building episodes; m0 is not finished'):
+            export(tmp_path / 'set', two_missions.source, PATROLS, ExportOptions(), workers=2)
+    assert not (tmp_path / 'set' / INFO).exists()
+    export(tmp_path / 'set', two_missions.source, PATROLS, ExportOptions(), workers=2)
+    assert contents(tmp_path / 'set') == contents(tmp_path / 'whole')
+
+
+@pytest.mark.long('an export for each file that it writes')
+def test_a_killed_drop_is_completed(two_missions: House, tmp_path: Path) -> None:
+    """Whoever looks at the dataset next finishes it: nothing of the mission is left."""
+    export(tmp_path / 'whole', two_missions.source, PATROLS, ExportOptions())
+    drop(tmp_path / 'whole', 'm0')
+    wanted = contents(tmp_path / 'whole')
+    for at in range(1, 100):
+        folder = tmp_path / f'set{at}'
+        export(folder, two_missions.source, PATROLS, ExportOptions())
+        with pytest.MonkeyPatch.context() as patch:
+            dying(patch, at)
+            try:
+                drop(folder, 'm0')
+            except Killed:
+                pass
+            else:
+                break
+        made = resumed(folder)
+        if 'm0' in made.mission_ids:  # before it was noted that it has to go
+            assert at == 1
+            continue
+        assert contents(folder) == wanted, at
+    assert at > 5

@@ -92,7 +92,7 @@ def values(made: Lerobot, *columns: str) -> list[Any]:
     return [matrix(table[name]) for name in columns]
 
 
-def test_a_wheeled_base(tmp_path: Path) -> None:
+def test_a_wheeled_base_is_exported_by_its_file(tmp_path: Path) -> None:
     """Its numbers are those of the messages at or before each tick, and ``info.json`` says from which topic they are."""
     made = exported(recorded(tmp_path, BASE), EXAMPLES / 'export_base.yaml')
     assert made.info['robot_type'] == 'turtlebot4'
@@ -110,7 +110,7 @@ def test_a_wheeled_base(tmp_path: Path) -> None:
     assert np.allclose(action[:, 1], -action[:, 0])
 
 
-def test_an_arm(tmp_path: Path) -> None:
+def test_an_arm_is_exported_by_its_file(tmp_path: Path) -> None:
     """Names of joints come from the message where the file gives none; images are as they were published."""
     made = exported(recorded(tmp_path, ARM), EXAMPLES / 'export_arm.yaml')
     features = made.info['features']

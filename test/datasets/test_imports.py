@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
 from datasets.recorded import House, Mission
-from datasets.test_arm import CLOCK, LEKIWI
+from datasets.test_clocks import CLOCK, LEKIWI
 from shadowhound_sim import so_arm
 
 from shadowhound_data_logger.cli.common import ExitCode
@@ -108,7 +108,7 @@ def assert_is_as_recorded(made: Lerobot) -> None:
 
 
 @pytest.mark.parametrize('version', [pytest.param('v2.1', marks=pytest.mark.long('as for v3.0')), 'v3.0'])
-def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, version: str) -> None:
+def test_a_dataset_of_the_arm_is_imported(house: House, tmp_path: Path, times: Path, version: str) -> None:
     """As it is, joints in degrees: stored once, in the catalogue, and each value traced to the object and the file."""
     arm, source = f'arm{version[1]}', lerobot_set(tmp_path / 'theirs', version)
     store = open_store(house.settings, UploadSettings())
@@ -124,7 +124,7 @@ def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, versio
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_a_data_set_without_a_unit(house: House, tmp_path: Path, times: Path) -> None:
+def test_a_dataset_without_a_unit_claims_none(house: House, tmp_path: Path, times: Path) -> None:
     """The numbers stay as they are, and no unit is claimed."""
     store = open_store(house.settings, UploadSettings())
     import_episodes(read_lerobot(lerobot_set(tmp_path / 'theirs', 'v3.0'), read_times(times), is_degrees=False), 'bare', store)
@@ -135,7 +135,7 @@ def test_a_data_set_without_a_unit(house: House, tmp_path: Path, times: Path) ->
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_demonstrations_in_hdf5(house: House, tmp_path: Path, times: Path) -> None:
+def test_demonstrations_in_hdf5_are_imported(house: House, tmp_path: Path, times: Path) -> None:
     """In the layout of ACT and ALOHA: qpos and action."""
     h5py = pytest.importorskip('h5py')
     paths = [tmp_path / f'episode_{number}.hdf5' for number in range(2)]
@@ -151,7 +151,7 @@ def test_demonstrations_in_hdf5(house: House, tmp_path: Path, times: Path) -> No
         list(read_hdf5(paths, read_times(times), fps=FPS, joints=('a', 'b')))
 
 
-def test_what_is_no_recording_is_refused(tmp_path: Path, times: Path) -> None:
+def test_a_file_that_is_not_a_recording_is_refused(tmp_path: Path, times: Path) -> None:
     """With what is wrong and what to do; nobody guesses when an episode began."""
     with pytest.raises(LakeError, match='not a LeRobotDataset'):
         list(read_lerobot(tmp_path, {}, is_degrees=False))
@@ -207,7 +207,7 @@ def counts(found: Imported) -> tuple[int, int, int, int]:
 
 
 @pytest.mark.parametrize('version', ['v2.1', 'v3.0'])
-def test_a_data_set_that_has_grown(shelf: Shelf, version: str) -> None:
+def test_only_the_new_episodes_of_a_grown_dataset_are_imported(shelf: Shelf, version: str) -> None:
     """Its shared file was written again: the new episode is added, and what is in the store stays as it is."""
     assert counts(shelf.bring(shelf.set(version))) == (2, 0, 0, 0)
     before = shelf.contents()
@@ -222,13 +222,13 @@ def test_a_data_set_that_has_grown(shelf: Shelf, version: str) -> None:
 
 
 @pytest.mark.parametrize(('version', 'how'), [('v2.1', {}), ('v3.0', {'files': 3}), ('v3.0', {'dtype': np.float64})])
-def test_the_layout_is_no_part_of_an_episode(shelf: Shelf, version: str, how: dict[str, Any]) -> None:
+def test_the_layout_does_not_change_an_episode(shelf: Shelf, version: str, how: dict[str, Any]) -> None:
     """Whatever files the episodes are in, also one episode in two of them, and however wide the columns are."""
     assert counts(shelf.bring(shelf.set())) == (2, 0, 0, 0)
     assert counts(shelf.bring(shelf.set(version, **how))) == (0, 2, 0, 0)
 
 
-def test_rows_in_another_order(shelf: Shelf) -> None:
+def test_rows_in_another_order_give_the_same_episode(shelf: Shelf) -> None:
     """Frames are in the order of their numbers, not of their rows."""
     shelf.bring(shelf.set())
     folder = shelf.set()
@@ -270,7 +270,7 @@ def test_another_unit_is_another_recording(shelf: Shelf) -> None:
     assert counts(shelf.bring(shelf.set(), is_degrees=False)) == (0, 0, 2, 0)
 
 
-def test_episodes_that_are_not_there_any_more_are_reported(shelf: Shelf) -> None:
+def test_removed_episodes_are_reported(shelf: Shelf) -> None:
     """They stay in the store. One that was removed from the middle: the others have other numbers, and are the same."""
     shelf.bring(shelf.set(numbers=(0, 1, 2)))
     before = shelf.contents()
@@ -280,7 +280,7 @@ def test_episodes_that_are_not_there_any_more_are_reported(shelf: Shelf) -> None
     assert shelf.contents() == before
 
 
-def test_episodes_in_another_order(shelf: Shelf) -> None:
+def test_episodes_in_another_order_are_the_same(shelf: Shelf) -> None:
     """With their own begins they are the same; with those of the old numbers they are refused, and nothing is stored twice."""
     shelf.bring(shelf.set(numbers=(0, 1, 2)))
     before = shelf.contents()
@@ -291,7 +291,7 @@ def test_episodes_in_another_order(shelf: Shelf) -> None:
     assert shelf.contents() == before
 
 
-def test_a_data_set_of_two(shelf: Shelf) -> None:
+def test_a_merged_dataset_imports_nothing_twice(shelf: Shelf) -> None:
     """Merged: what was imported of either one is there already."""
     shelf.bring(shelf.set(numbers=(0, 1)), begins=(0, 1))
     shelf.bring(shelf.set(numbers=(2,)), begins=(2,))
@@ -299,7 +299,7 @@ def test_a_data_set_of_two(shelf: Shelf) -> None:
 
 
 @pytest.mark.parametrize('shift_s', [-1.5, 1.5, 3.9])
-def test_two_recordings_of_one_time(shelf: Shelf, shift_s: float) -> None:
+def test_two_recordings_of_the_same_time_are_refused(shelf: Shelf, shift_s: float) -> None:
     """An arm has one at a time: another one is refused, also in the same dataset, and one after it is taken."""
     shelf.bring(shelf.set(numbers=(0,)))
     other = shelf.set(numbers=(3, 4))
@@ -311,7 +311,7 @@ def test_two_recordings_of_one_time(shelf: Shelf, shift_s: float) -> None:
     assert counts(double) == (1, 0, 1, 0)
 
 
-def test_an_import_that_was_killed(shelf: Shelf) -> None:
+def test_a_killed_import_is_completed(shelf: Shelf) -> None:
     """Of the second episode there are the joints alone, not the commands and not the rows of the catalogue."""
     folder = shelf.set()
     shelf.bring(folder)
@@ -323,7 +323,7 @@ def test_an_import_that_was_killed(shelf: Shelf) -> None:
     assert shelf.contents() == whole
 
 
-def test_a_long_episode(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_episode_is_one_episode(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is in several objects, and one episode still."""
     monkeypatch.setattr('shadowhound_data_logger.datasets.imports.PART', 50)
     found = shelf.bring(shelf.set())
@@ -350,7 +350,7 @@ def test_numbers_that_are_equal_have_one_identity() -> None:
     assert len({one, *(identity_of(*other) for other in others)}) == 1 + len(others)
 
 
-def test_a_frame_that_is_there_twice(shelf: Shelf) -> None:
+def test_a_repeated_frame_is_refused(shelf: Shelf) -> None:
     """A file of an earlier version lies in the folder still."""
     folder = shelf.set(files=2)
     (folder / 'data/chunk-000/file-002.parquet').write_bytes((folder / 'data/chunk-000/file-001.parquet').read_bytes())
@@ -358,7 +358,7 @@ def test_a_frame_that_is_there_twice(shelf: Shelf) -> None:
         shelf.bring(folder)
 
 
-def test_what_others_left_in_the_store_is_not_taken_for_an_import(shelf: Shelf) -> None:
+def test_foreign_objects_are_not_taken_for_an_import(shelf: Shelf) -> None:
     """Keys that look like ours with a date that is none, what the arm logged itself, and metadata that is no number."""
     shelf.bring(shelf.set(numbers=(0,)))
     root = shelf.settings.directory / 'sensor-data/arm/joint_states'
@@ -371,7 +371,7 @@ def test_what_others_left_in_the_store_is_not_taken_for_an_import(shelf: Shelf) 
 
 
 @pytest.mark.parametrize('column', ['episode_index', 'frame_index'])
-def test_invalid_frame_numbers(shelf: Shelf, column: str) -> None:
+def test_invalid_frame_numbers_are_refused(shelf: Shelf, column: str) -> None:
     folder = shelf.set()
     path = folder / 'data/chunk-000/file-000.parquet'
     table = pq.read_table(path)

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from datasets.recorded import House, Mission, x_of
-from datasets.test_arm import record_arm
+from datasets.test_clocks import record_arm
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.datasets.export import export
@@ -117,14 +117,14 @@ def test_two_exports_are_merged_by_lerobot(house: House, tmp_path: Path) -> None
     assert int(np.load(tmp_path / 'out.npz')['episodes']) == 2
 
 
-def test_what_was_exported_is_proved(house: House, tmp_path: Path) -> None:
+def test_an_export_passes_verification(house: House, tmp_path: Path) -> None:
     """After lerobot has read it, too: it changes nothing."""
     export(tmp_path / 'set', house.source, PATROLS, ExportOptions())
     with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
 
 
-def test_a_robot_with_its_arm(tmp_path: Path) -> None:
+def test_a_robot_with_its_arm_is_loaded_by_lerobot(tmp_path: Path) -> None:
     """Two sets of a task, each loaded by lerobot, and merged: the state at every tick is what was written, joint by joint."""
     place = House(tmp_path / 'house')
     for number in range(2):
@@ -160,7 +160,7 @@ def three(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize('layout', LAYOUTS)
-def test_lerobot_reads_a_set_in_every_way(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
+def test_lerobot_reads_a_dataset_in_every_way(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
     """By index, with torchcodec and with PyAV; windows in two workers; and streamed, but for a video of each episode.
 
     lerobot#4524: where this fails because lerobot can stream them, the layout ``shared`` is not needed any more.
@@ -178,7 +178,7 @@ def test_lerobot_reads_a_set_in_every_way(three: dict[str, Path], tmp_path: Path
 
 
 @pytest.mark.parametrize('layout', ['episode', 'shared', 'lossless'])
-def test_lerobots_tools_take_a_set(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
+def test_lerobots_tools_accept_a_dataset(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
     """Each frame that is left has its numbers, and its picture as close as another encoding keeps it."""
     with_lerobot(tmp_path, 'tools', str(tmp_path / 'made'), str(three[layout]))
     said = json.loads((tmp_path / 'made/said.json').read_text())
@@ -195,7 +195,7 @@ def test_lerobots_tools_take_a_set(three: dict[str, Path], tmp_path: Path, layou
         assert streamed['wrong'] or streamed['error']
 
 
-def test_lerobots_viewer_shows_a_set(three: dict[str, Path], tmp_path: Path) -> None:
+def test_lerobots_viewer_shows_a_dataset(three: dict[str, Path], tmp_path: Path) -> None:
     """Its recording for Rerun has an episode that is in the middle of a shared video."""
     with_lerobot(tmp_path, 'view', str(tmp_path / 'shown'), str(three['shared']))
     (path,) = (tmp_path / 'shown').iterdir()
@@ -204,7 +204,7 @@ def test_lerobots_viewer_shows_a_set(three: dict[str, Path], tmp_path: Path) -> 
     assert path.stat().st_size > 21 * 64 * 96 * 3 // 2
 
 
-def test_an_arms_set_that_lerobot_recorded_and_edited(tmp_path: Path) -> None:
+def test_a_dataset_edited_with_lerobot_keeps_its_episodes(tmp_path: Path) -> None:
     """An episode is the same after it has grown and after each tool, whatever the files and numbers are now."""
     with_lerobot(tmp_path, 'arm', str(tmp_path / 'arm'))
     house = House(tmp_path / 'house')

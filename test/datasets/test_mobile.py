@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from datasets.recorded import House, Mission, video_frames, x_of
-from datasets.test_arm import CLOCK, arm_stamps, record_arm
+from datasets.test_clocks import CLOCK, arm_stamps, record_arm
 from rosbags.highlevel import AnyReader
 from shadowhound_sim import so_arm
 
@@ -86,7 +86,7 @@ def test_frames_are_listed_in_a_table(task: tuple[Path, Exported]) -> None:
     assert not (folder / 'synchronized/detections.json').exists()
 
 
-def test_detections_are_handed_on_and_a_mission_is_taken_out(house: House, tmp_path: Path) -> None:
+def test_detections_are_exported_and_a_mission_is_dropped(house: House, tmp_path: Path) -> None:
     """By episode, with the objects that they came from; nothing of a mission that was dropped is left."""
     mission = Mission('', begin_s=100, seconds=2)
     told: dict[str, Any] = {'samples': [{'stamp_ns': mission.begin_ns + 10, 'detections': [{'id': 'cup'}]}]}

@@ -1,4 +1,7 @@
-"""Of which bag, or of which objects, an episode is made: of those of the mission's own time, its own bags first."""
+"""Of which bag, or of which objects, an episode is made: of those of the mission's own time, its own bags first.
+
+Where a bag has more of a sensor than the objects have, the dataset is made of the bag, and says so.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
-from datasets.recorded import TOPICS, House, Mission, cdr_of
+from datasets.recorded import TOPICS, House, Mission, cdr_of, x_of
 from lake.gap_parts import tell
 from lake.making import NOON_NS, add
 from lake.training import COMPRESSED, ODOMETRY
+from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import slice_file
@@ -24,9 +28,10 @@ from shadowhound_data_logger.cli import export as verb
 from shadowhound_data_logger.cli.common import ExitCode
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.datasets import series
 from shadowhound_data_logger.datasets.export import Exported, export
 from shadowhound_data_logger.datasets.features import ExportOptions
-from shadowhound_data_logger.datasets.lerobot import SOURCE_TABLE, Lerobot
+from shadowhound_data_logger.datasets.lerobot import DATA, SOURCE_TABLE, Lerobot, matrix
 from shadowhound_data_logger.datasets.verify import verify
 from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
@@ -102,7 +107,7 @@ def told(found: Exported, mission: str, stream: str = 'images.front') -> dict[st
     return dict(mine['streams'][stream])
 
 
-def test_two_missions_that_are_four_seconds_apart(yard: Yard) -> None:
+def test_missions_that_are_four_seconds_apart_are_separate(yard: Yard) -> None:
     """Each is made of its own bag, at that bag's rate, though the earlier one has far more messages."""
     yard.mission('one', 0)
     yard.mission('two', 8)
@@ -116,7 +121,7 @@ def test_two_missions_that_are_four_seconds_apart(yard: Yard) -> None:
     assert verify(yard.folder / 'set', DirectoryStore(yard.settings.directory), frames=None).wrong == []
 
 
-def test_the_own_bag_comes_before_one_of_the_same_time(yard: Yard) -> None:
+def test_the_missions_bag_takes_precedence_over_another_one(yard: Yard) -> None:
     """By the mission's id: a denser bag of no mission, of another one, and of an event in it are left alone."""
     yard.mission('one', 20)
     own = yard.bag('own', (20, 24), mission=of('one'))
@@ -127,7 +132,7 @@ def test_the_own_bag_comes_before_one_of_the_same_time(yard: Yard) -> None:
     assert list(yard.sources('one')) == list(yard.sources('one', 'state.pose')) == [f'{own}own_0.mcap']
 
 
-def test_an_own_bag_without_the_missions_id(yard: Yard) -> None:
+def test_a_bag_with_only_the_run_id_belongs_to_its_mission(yard: Yard) -> None:
     """While a mission is not known to MLflow its bag may have the id of the run alone."""
     yard.mission('one', 20)
     own = yard.bag('own', (20, 24), mission=MissionOf('patrol', None, 'runone'))
@@ -136,7 +141,7 @@ def test_an_own_bag_without_the_missions_id(yard: Yard) -> None:
     assert list(yard.sources('one')) == [f'{own}own_0.mcap']
 
 
-def test_a_bag_that_spans_several_missions(yard: Yard) -> None:
+def test_each_mission_gets_its_slices_of_a_shared_bag(yard: Yard) -> None:
     """Each is made of the slices of its own time, whoever's mission it was when the bag began."""
     yard.mission('one', 3)
     yard.mission('two', 13)
@@ -148,7 +153,7 @@ def test_a_bag_that_spans_several_missions(yard: Yard) -> None:
         assert told(found, mission)['from'] == 'bags'
 
 
-def test_a_mission_without_a_bag_next_to_one_with(yard: Yard) -> None:
+def test_a_mission_without_a_bag_uses_the_bag_of_its_neighbor_where_it_has_more(yard: Yard) -> None:
     """The other one's bag reaches a second into it, with more pictures than all of its objects: these are taken."""
     yard.mission('one', 0)
     yard.mission('two', 5)
@@ -170,7 +175,7 @@ def test_an_excerpt_does_not_represent_a_mission(yard: Yard) -> None:
     assert found.refused == {}
 
 
-def test_a_mission_that_was_recorded_in_two_bags(yard: Yard) -> None:
+def test_a_mission_may_be_in_two_bags(yard: Yard) -> None:
     """The node was started again: the episode has the messages of both, and what no bag has in between is stale."""
     yard.mission('one', 0, 8)
     parts = [yard.bag('first', (0, 4), mission=of('one')), yard.bag('then', (5, 8), mission=of('one'))]
@@ -237,7 +242,7 @@ def test_objects_from_before_a_mission_do_not_count(yard: Yard) -> None:
     assert told(found, 'one')['topic'] == TOPICS['camera']
 
 
-def test_where_objects_have_more_of_the_mission(yard: Yard) -> None:
+def test_objects_are_used_where_they_have_more_of_the_mission(yard: Yard) -> None:
     """Its own bag has less in the mission than the objects, and more in the ten seconds before it."""
     yard.mission('one', 20, camera_hz=20.0, odom_hz=20.0)
     yard.bag('own', (10, 19.5), (20, 24), hz=15, mission=of('one'))
@@ -290,7 +295,7 @@ def asked(yard: Yard, home: Path, *more: str) -> tuple[int, str]:
     (('--mission', 'slow', '--dry-run'), '0 missions would be exported to'),
     (('--mission', 'slow'), 'No mission was exported, 1 refused.'),
 ])  # fmt: skip
-def test_the_totals_of_the_command(mixed: Yard, tmp_path: Path, more: Sequence[str], total: str) -> None:
+def test_the_command_counts_refused_missions(mixed: Yard, tmp_path: Path, more: Sequence[str], total: str) -> None:
     """Refused ones are counted as such, and the exit code is 1, in a dry run and in a real one."""
     code, output = asked(mixed, tmp_path / 'home', *more)
     assert code == ExitCode.FINDING
@@ -320,3 +325,80 @@ def test_spans_are_cut_out_of_each_other() -> None:
         assert there == [step for step in range(first.first_ns, first.last_ns + 1)
                          if not any(other.first_ns <= step <= other.last_ns for other in others)]  # fmt: skip
         assert all(one.last_ns < other.first_ns for one, other in pairwise(left))
+
+
+def record_bag(house: House, tmp_path: Path, *, is_there: bool = True) -> tuple[Mission, str]:
+    """A dense recording beside the objects, and the key of its slice, which a robot may keep."""
+    dense = Mission('bagged', seconds=2, camera_hz=10.0, odom_hz=50.0)
+    path = tmp_path / 'bagged_0.mcap'
+    writer = SliceWriter(path)
+    for sensor, kind in (('camera', COMPRESSED), ('odom', ODOMETRY)):
+        channel = Channel(TOPICS[sensor], kind, *describe(kind), '')
+        for number, stamp in enumerate(dense.stamps(sensor)):
+            writer.write(channel, stamp + 2_000_000, stamp, number, cdr_of(house.drive._ros, sensor, stamp))
+    info = writer.close()
+    key = 'thor/rosbags/bagged/bagged_0.mcap'
+    manifest = Manifest('bagged', 'thor', None, COMPLETE, (), topics_of([info]), (SliceEntry.of(info, key),))
+    with closing(open_store(house.settings, UploadSettings())) as store:
+        if is_there:
+            add(store, tmp_path / 'tmp', key, path.read_bytes())
+        add(store, tmp_path / 'tmp', 'thor/rosbags/bagged/manifest.json', manifest.to_json())
+    return dense, key
+
+
+def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
+    """The camera at its own rate of a bag, its sources the slices, and all of it proved."""
+    house = House(tmp_path)
+    mission = house.record(Mission('bagged', seconds=2, camera_hz=1.0, odom_hz=2.0, sensors=('camera', 'odom')))
+    dense, key = record_bag(house, tmp_path)
+    tell(house.settings, tmp_path, *(
+        complete('thor', 'j', 99, sink='bags', topic=TOPICS[sensor], session=1, grade='exact', received=1, skipped=0,
+                 from_ns=mission.begin_ns - 2 * SECOND, to_ns=mission.end_ns + SECOND,
+                 received_from_ns=mission.begin_ns - 2 * SECOND, received_to_ns=mission.end_ns + SECOND)
+        for sensor in ('camera', 'odom')
+    ), name='bags')  # fmt: skip
+    found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
+    assert (found.refused, found.waiting, found.fps) == ({}, {}, 10)
+    assert {each['from'] for each in found.added[0]['streams'].values()} == {'bags'}
+    made = Lerobot(tmp_path / 'set')
+    table = pq.read_table(made.path(DATA, made.rows[0], 'data'))
+    stamps, published = table['shadowhound.stamp_ns'].to_numpy(), np.array(dense.stamps('odom'))
+    newest = published[np.searchsorted(published, stamps, 'right') - 1]
+    assert matrix(table['observation.state'])[:, 0] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
+    sources = pq.read_table(tmp_path / 'set/meta/shadowhound_sources.parquet')
+    assert set(sources['key'].to_pylist()) == {key}
+    assert set((sources['received_ns'].to_numpy() - sources['stamp_ns'].to_numpy()).tolist()) == {2_000_000}
+    proved = verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None)
+    assert (proved.wrong, proved.frames) == ([], len(table))
+    by_received = export(tmp_path / 'received', house.source, {'mission_type': 'patrol'}, ExportOptions(by='received'))
+    assert {each['from'] for each in by_received.added[0]['streams'].values()} == {'bags'}
+    (row,) = Lerobot(tmp_path / 'received').rows
+    ticks = pq.read_table(Lerobot(tmp_path / 'received').path(DATA, row, 'data'))['shadowhound.stamp_ns'].to_numpy()
+    sources = pq.read_table(tmp_path / 'received/meta/shadowhound_sources.parquet')
+    assert set((sources['received_ns'].to_numpy() - sources['stamp_ns'].to_numpy()).tolist()) == {2_000_000}
+    age_ns = ticks[sources['frame'].to_numpy()] - sources['received_ns'].to_numpy()
+    assert sources['held_s'].to_numpy() * SECOND == pytest.approx(age_ns, abs=1000)
+
+
+def test_slices_that_a_robot_keeps_are_not_missed(tmp_path: Path) -> None:
+    """The store has the manifest of the bag alone: the dataset is made of the objects."""
+    house = House(tmp_path)
+    house.record(Mission('bagged', seconds=2, camera_hz=5.0, odom_hz=5.0, sensors=('camera', 'odom')))
+    record_bag(house, tmp_path, is_there=False)
+    found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
+    assert (found.refused, found.waiting) == ({}, {})
+    assert {each['from'] for each in found.added[0]['streams'].values()} == {'objects'}
+
+
+def test_what_an_imu_marks_as_unknown_is_nan_in_a_bag_as_well() -> None:
+    """As in an object: a set is not made of an orientation that the IMU does not measure."""
+    types = get_typestore(Stores.ROS2_HUMBLE).types
+    vector, covariance = types['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0), np.zeros(9)
+    header = types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](1, 0), '')
+    turn = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    for mark in (-1.0, 0.0):
+        unknown = np.array([mark, *[0.0] * 8])
+        message = types['sensor_msgs/msg/Imu'](header, turn, unknown, vector, covariance, vector, covariance)
+        values = series._values(message, 'sensor_msgs/msg/Imu', ())
+        assert values[:6].tolist() == [1.0, 2.0, 3.0] * 2
+        assert np.isnan(values[6:]).all() == (mark == -1.0)

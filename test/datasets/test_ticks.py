@@ -64,7 +64,7 @@ def test_velocities_are_those_of_a_circle() -> None:
     assert found == pytest.approx(np.tile([speed, 0.0, rate], (len(later), 1)), abs=1e-3)
 
 
-def test_quaternions_turn_the_shorter_way() -> None:
+def test_quaternions_are_interpolated_the_shorter_way() -> None:
     """Half way between two of opposite sign is their middle, of length one."""
     turned = np.array([[0, 0, np.sin(0.1), np.cos(0.1)], [0, 0, -np.sin(0.3), -np.cos(0.3)]])
     found, earlier = interpolated(np.array([0, 100]), turned, np.array([150]), SECOND, (slice(0, 4),))

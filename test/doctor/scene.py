@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
+from stores.fake_s3 import hung, refused
+
+from shadowhound_data_logger.core import mlflow_rest
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.doctor import s3
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.model import Context, Result, Role
@@ -127,3 +132,31 @@ def expect(found: list[Result], name: str, *words: str) -> None:
 def scenes(tmp_path: Path) -> Iterator[Scene]:
     with ExitStack() as stack:
         yield Scene.healthy(tmp_path, stack)
+
+
+Inject = Callable[[Scene], None]
+
+
+@contextmanager
+def patient(seconds: float) -> Iterator[None]:
+    """How long an answer may take."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(s3, 'ANSWER_S', seconds)
+        patch.setattr(mlflow_rest, 'TIMEOUT_S', seconds)
+        yield
+
+
+def keys(**changes: str) -> Inject:
+    return lambda scene: scene.environ.update(changes)
+
+
+def nobody_there(variable: str) -> Inject:
+    return lambda scene: scene.environ.update({variable: scene.stack.enter_context(refused())})
+
+
+def hanging(variable: str) -> Inject:
+    def inject(scene: Scene) -> None:
+        scene.stack.enter_context(patient(0.5))
+        scene.environ[variable] = scene.stack.enter_context(hung())
+
+    return inject

@@ -23,7 +23,7 @@ def guessed(scene: Scene) -> Role:
     return make(scene.environ, root=scene.root).role
 
 
-def test_ros_and_a_spool_are_thor(scene: Scene) -> None:
+def test_ros_and_a_spool_make_the_role_robot(scene: Scene) -> None:
     """Also where somebody tries a Tower of his own on the robot."""
     scene.environ['ROS_DISTRO'] = 'humble'
     scene.spool.mkdir(parents=True)
@@ -32,7 +32,7 @@ def test_ros_and_a_spool_are_thor(scene: Scene) -> None:
     assert guessed(scene) is Role.ROBOT
 
 
-def test_servers_are_tower(scene: Scene, tmp_path: Path) -> None:
+def test_servers_make_the_role_tower(scene: Scene, tmp_path: Path) -> None:
     """One that listens on a port of the guide or of the variables, or what the compose file is started with."""
     scene.listen('00000000:2328')
     assert guessed(scene) is Role.SERVER
@@ -46,7 +46,7 @@ def test_servers_are_tower(scene: Scene, tmp_path: Path) -> None:
     assert guessed(scene) is Role.SERVER
 
 
-def test_the_rest_is_by_ros(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_role_otherwise_depends_on_ros(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot on its first day, and somebody's desk."""
     scene.environ['ROS_DISTRO'] = 'humble'
     assert guessed(scene) is Role.ROBOT
@@ -66,7 +66,7 @@ def test_invalid_settings_are_reported_and_dropped(scene: Scene) -> None:
     assert next(sensor.rate_hz for sensor in made.settings.sensors if sensor.name == 'odom') == 2.0
 
 
-def test_sensors_that_exclude_each_other(scene: Scene) -> None:
+def test_contradicting_sensors_fall_back_to_the_defaults(scene: Scene) -> None:
     """Where it is not a single parameter that is wrong, the defaults are taken: it ends."""
     scene.parameters = {'sensors': ['imu', 'imu'], 'imu.topics': ['a']}
     scene.environ['SHADOWHOUND_ROBOT'] = 'tachi'
@@ -75,7 +75,7 @@ def test_sensors_that_exclude_each_other(scene: Scene) -> None:
     assert {error.data['name'] for error in scene.context().refused} == {'camera.types', 'robot'}
 
 
-def test_a_parameter_file(tmp_path: Path) -> None:
+def test_a_parameter_file_is_read_like_the_nodes(tmp_path: Path) -> None:
     """Those of our node and of all nodes, flat; other nodes' are not ours."""
     path = tmp_path / 'a.yaml'
     path.write_text('/**:\n  ros__parameters: {robot: tachi}\nsensor_logger_node:\n  ros__parameters:\n    imu: {batch_s: 2.0}\n'
@@ -90,7 +90,7 @@ def test_a_parameter_file(tmp_path: Path) -> None:
         read_parameters(path)
 
 
-def test_a_parameter_file_of_two_robots(tmp_path: Path) -> None:
+def test_a_parameter_file_of_two_robots_is_read_by_namespace(tmp_path: Path) -> None:
     """Of each namespace its own."""
     path = tmp_path / 'fleet.yaml'
     path.write_text(
@@ -103,7 +103,7 @@ def test_a_parameter_file_of_two_robots(tmp_path: Path) -> None:
     assert [error.data['name'] for error in make({}, parameter_file=path, namespace='/other').refused] == ['imu.rate_hz']
 
 
-def test_who_can_reach_what_listens(scene: Scene) -> None:
+def test_listening_addresses_are_classified(scene: Scene) -> None:
     """IPv4 and IPv6, as the kernel writes them; what is connected does not listen."""
     scene.listen('0100007F:1389', '00000000:2328', '0A01A8C0:0050')
     six = (
@@ -118,7 +118,7 @@ def test_who_can_reach_what_listens(scene: Scene) -> None:
     }  # fmt: skip
 
 
-def test_domains_that_are_in_use(scene: Scene) -> None:
+def test_domains_in_use_are_found(scene: Scene) -> None:
     """By the port on which everybody of a domain listens, or the first one who does without multicast; each domain once."""
     (scene.root / 'proc/net/udp').write_text(
         'head\n 1: 00000000:1CE8 0:0 07\n 2: 00000000:21CA 0:0 07\n 3: 00000000:1CF2 0:0 07\n 4: 0100007F:23C8 0:0 07\n'

@@ -38,7 +38,7 @@ def test_a_crash_is_a_finding_and_stops_no_other_check(scene: Scene) -> None:
     assert found[1].severity is Severity.ERROR
 
 
-def test_a_check_that_hangs_is_a_finding_in_time(scene: Scene) -> None:
+def test_a_hung_check_is_a_finding_at_its_deadline(scene: Scene) -> None:
     """Also where that leaves no time for what comes after it, which is said."""
     over = threading.Event()
 
@@ -57,7 +57,7 @@ def test_a_check_that_hangs_is_a_finding_in_time(scene: Scene) -> None:
     assert '--only hangs' in found[1].remedy
 
 
-def test_a_check_with_its_own_deadline(scene: Scene) -> None:
+def test_a_check_with_its_own_deadline_leaves_time_for_the_others(scene: Scene) -> None:
     """A check that hangs leaves the rest of the time to what comes after it."""
     over = threading.Event()
     hangs = Check(name='hangs', run=lambda _: iter([ok('hangs.one', str(over.wait(120.0)))]), deadline_s=LIMIT_S)
@@ -66,7 +66,7 @@ def test_a_check_with_its_own_deadline(scene: Scene) -> None:
     assert [result.check for result in found] == ['hangs.deadline', 'fine.one']
 
 
-def test_what_was_found_before_is_known_after(scene: Scene) -> None:
+def test_a_check_sees_the_results_of_earlier_checks(scene: Scene) -> None:
     """By the checks that come after, which wait for it."""
     seen: list[Result | None] = []
 
@@ -89,7 +89,7 @@ def test_checks_run_side_by_side(scene: Scene) -> None:
     assert sorted(result.check for result in run(scene, *wait)) == ['met', 'met']
 
 
-def test_a_process_that_dies_is_a_finding(scene: Scene) -> None:
+def test_a_crashed_process_is_a_finding(scene: Scene) -> None:
     """With the last words it said: here, that there is no such check."""
     (found,) = in_child(Running(Check(name='nothing', run=fine)), scene.context())
     assert found.check == 'nothing.crash'
@@ -115,7 +115,7 @@ def test_every_role_has_its_checks(role: Role) -> None:
     assert all(name in mine for check in mine.values() for name in check.after)
 
 
-def test_a_dead_network(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_network_the_examination_ends_in_time(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing answers, not even the name server: it ends within the bar, each service is named, and the rest is asked."""
     over = threading.Event()
 

@@ -103,7 +103,7 @@ def test_everything_is_stored_by_its_type(node: Node, stored: Callable[..., Obje
     assert len(objects.sensor('tb4_map')) == len(objects.sensor('tb4_robot_description')) == 1
 
 
-def test_what_has_no_rule_is_named(node: Node) -> None:
+def test_topics_without_a_rule_are_named(node: Node) -> None:
     """In the log, and nothing of it is stored."""
     assert f'{NS}/led (std_msgs/msg/ColorRGBA) is not logged: there is no rule for std_msgs/msg/ColorRGBA' in node.log
 

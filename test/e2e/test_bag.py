@@ -30,7 +30,7 @@ def test_the_bag_is_complete_in_every_reader(session: Session) -> None:
 
 
 @pytest.mark.parametrize('topic', TYPES)
-def test_every_message_is_there_as_it_was_published(session: Session, topic: str) -> None:
+def test_every_message_is_in_the_bag_as_published(session: Session, topic: str) -> None:
     """Equal bytes in the same order, with the time of the header or of sending and, not before it, the time of arrival.
 
     The first ones beside another RMW come in any order: one of the two subscriptions with which a node begins gets what was sent
@@ -48,7 +48,7 @@ def test_every_message_is_there_as_it_was_published(session: Session, topic: str
     assert len({message.sequence for message in found}) == len(found)
 
 
-def test_bags_are_a_sink_of_their_own_in_the_ledger(session: Session) -> None:
+def test_bags_are_a_separate_sink_in_the_ledger(session: Session) -> None:
     """All that was published was recorded and delivered, whatever the sensors kept of it."""
     assert set(session.ledger['bags']) == set(TYPES)
     for topic, row in session.ledger['bags'].items():
@@ -79,7 +79,7 @@ def _row(session: Session, key: str) -> dict[str, Any]:
         return dict(db.execute('SELECT * FROM objects WHERE key = ?', (key,)).fetchone())
 
 
-def test_the_services_begin_pause_split_and_end_a_bag(
+def test_the_services_start_pause_split_and_stop_a_bag(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:
     """Of a topic that no sensor takes: what came between start and stop is in the bag but for the pause, in two slices."""
@@ -115,7 +115,7 @@ def test_the_services_begin_pause_split_and_end_a_bag(
     assert not list((processes.folder / 'home' / 'bags' / processes.robot).iterdir())
 
 
-def test_a_bag_begins_with_what_was_latched(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
+def test_a_bag_starts_with_latched_messages(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
     """What a latched publisher sent before the recording is in the bag, once, though a sensor had taken it long ago."""
     parameters = {'sensors': ['map'], 'map.topics': ['/b_map'], 'map.rate_hz': 0.0}
     node = processes.node(seaweed.environment(), parameters)

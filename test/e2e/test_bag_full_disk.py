@@ -48,7 +48,9 @@ def fill(path: Path, seconds: float) -> None:
                 time.sleep(0.001)
 
 
-def test_a_disk_that_is_full_for_a_while(processes: Processes, disk: Path, seaweed: Tower, tmp_path: Path) -> None:
+def test_a_disk_that_is_full_for_a_while_costs_the_messages_of_that_time(
+    processes: Processes, disk: Path, seaweed: Tower, tmp_path: Path
+) -> None:
     """Nothing crashes, what was written before can be read at any moment, manifest and ledger name what is missing."""
     parameters = {'bag.record': 'always', 'bag.slice_s': 60.0, 'spool.min_free_bytes': 8 * MEBI}
     node = processes.node(seaweed.environment(), parameters, home='disk/home')

@@ -97,7 +97,7 @@ def robot(processes: Processes, tmp_path: Path) -> Robot:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_a_clock_that_is_set_later(robot: Robot) -> None:
+def test_objects_are_dated_when_the_clock_is_set(robot: Robot) -> None:
     """Nothing is stored under a date of 1970, all of it under the right one, and the ledger says what the clock did."""
     robot.publish()
     robot.node.stop()
@@ -120,7 +120,7 @@ def test_a_clock_that_is_set_later(robot: Robot) -> None:
 
 
 @pytest.mark.long('ten seconds of a clock that is not set')
-def test_bags_of_a_clock_that_is_set_later(robot: Robot, tmp_path: Path) -> None:
+def test_bags_are_dated_when_the_clock_is_set(robot: Robot, tmp_path: Path) -> None:
     """Each has the date at which it began, also one that ended before anybody knew it; none spans the moment, nothing is lost."""
     robot.node.stop()
     began_ns = [time.time_ns()]

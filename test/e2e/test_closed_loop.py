@@ -81,7 +81,7 @@ def summary(server: Server, command: str) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.long('a robot, a node, a Tower with MLflow, and a dozen commands')
 @pytest.mark.timeout(900)
-def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
+def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - one story
     processes: Processes, tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The robot goes where the policy says, stands when it is gone, and the mission's run leads to the data it was made of."""

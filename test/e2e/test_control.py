@@ -73,7 +73,7 @@ def test_a_flush_spools_all_that_was_published_before(operated: Operated) -> Non
     assert operated.numbers('flushed') == list(range(COUNT))
 
 
-def test_flushes_inside_a_second_overwrite_nothing(operated: Operated) -> None:
+def test_flushes_within_a_second_overwrite_nothing(operated: Operated) -> None:
     """Objects of the same period have names of their own."""
     operated.publisher.matched('/repeated')
     for number in range(5):
@@ -185,7 +185,7 @@ def test_the_command_line_does_what_the_services_do(operated: Operated) -> None:
     [('rate_hz', 5.0), ('rate_hz', 5), ('priority', 7), ('priority', 7.5), ('rate_hz', -1.0), ('rate_hz', 1e-9),
      ('rate_hz', 'often'), ('enabled', 1), ('priority', 10), ('quality', 101), ('batch_s', 1.0)],
 )  # fmt: skip
-def test_a_parameter_is_judged_alike(operated: Operated, name: str, value: Any) -> None:
+def test_a_parameter_is_checked_alike_by_services_and_command_line(operated: Operated, name: str, value: Any) -> None:
     """By the command line and by ROS; what is refused has the same reason, and says more where it can never be set."""
     full = f'asked.{name}'
     before = operated.station.get(full)
@@ -235,7 +235,7 @@ def test_the_status_file_matches_the_ledger(operated: Operated) -> None:
 
 
 @pytest.mark.long('robots of their own')
-def test_two_robots_on_one_machine(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+def test_two_robots_on_one_machine_share_a_spool(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """Two nodes in namespaces of their own share a spool: both log, one of them delivers for both, both accounts balance."""
     robots = [f'{processes.robot}_{number}' for number in range(2)]
     parameters = {'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.2}

@@ -45,7 +45,7 @@ LARGE_COUNT = 40
 @pytest.mark.skipif(possible_buffer() < 1 << 20, reason='net.core.rmem_max is below 1 MB: a matter of luck for either')
 @pytest.mark.long('fourteen seconds of images and clouds')
 @pytest.mark.parametrize('kind', LARGE)
-def test_large_messages_come_as_they_do_to_cyclone_dds(processes: Processes, kind: str) -> None:
+def test_large_messages_arrive_as_they_do_with_cyclone_dds(processes: Processes, kind: str) -> None:
     """Raw images and clouds, BEST_EFFORT and depth 1 as a Go2's driver has them: never fewer than its own RMW gets."""
     type_name, rate_hz, fields = LARGE[kind]
     own = {'sensors': ['large'], 'large.topics': ['large'], 'large.types': [type_name], 'large.format': 'cdr'}
@@ -66,7 +66,7 @@ def test_large_messages_come_as_they_do_to_cyclone_dds(processes: Processes, kin
 
 @pytest.mark.slow
 @pytest.mark.long('a node that is stopped until Fast DDS loses its place')
-def test_a_publisher_that_outruns_the_node(processes: Processes) -> None:
+def test_a_publisher_that_outruns_the_node_loses_messages_and_not_the_topic(processes: Processes) -> None:
     """It no longer has the parts that the node lacks, and Fast DDS loses its place: nothing is invented, the topic goes on.
 
     Humble's Fast DDS 2.6 keeps its place here, so there the node is stopped a number of times only.

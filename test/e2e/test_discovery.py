@@ -128,7 +128,7 @@ def as_humble(folder: Path) -> Mapping[str, str]:
 
 @pytest.mark.long('machines of their own, one after the other')
 @pytest.mark.parametrize('case', CASES)
-def test_whom_cyclone_dds_finds_we_find(found: dict[str, tuple[list[str], list[str]]], case: str) -> None:
+def test_publishers_that_cyclone_dds_finds_are_found(found: dict[str, tuple[list[str], list[str]]], case: str) -> None:
     """Nothing that the robot's own RMW hears is lost, and nobody else is heard."""
     by_cyclone, by_us = found[case]
     assert set(by_cyclone) <= set(by_us), 'the robot hears what we do not'

@@ -59,7 +59,7 @@ def event_of(node: Node, processes: Processes, store: ObjectStore, folder: Path)
     return bag
 
 
-def test_what_came_before_a_trigger_and_after_it_is_in_a_bag(
+def test_messages_before_and_after_a_trigger_are_in_a_bag(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:
     """Of topics that no sensor takes; the manifest says who triggered, the ledger counts what was asked for, and nothing else."""
@@ -90,7 +90,7 @@ def test_what_came_before_a_trigger_and_after_it_is_in_a_bag(
 
 
 @pytest.mark.long('fifteen seconds of events')
-def test_conditions_and_what_an_agent_logs_trigger(processes: Processes, seaweed: Tower, store: ObjectStore) -> None:
+def test_conditions_and_agent_events_trigger(processes: Processes, seaweed: Tower, store: ObjectStore) -> None:
     """Over all topics of the robot, from the subscriptions that serve objects and a bag as well; nothing of it is lost."""
     parameters = {
         'events.regex': '.*', 'events.exclude': 'image_raw|rosout|events|sensor_logger_node|diagnostics', 'events.post_s': 8.0,
@@ -141,7 +141,9 @@ def messages_in(open_slice: Path) -> int:
 
 
 @pytest.mark.long('a kill')
-def test_a_kill_in_the_middle_of_an_event(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
+def test_the_next_start_completes_an_event_that_a_kill_interrupted(
+    processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
+) -> None:
     """The next start makes its bag whole with what was written; the bag and the ledger say what is missing."""
     node = processes.node(seaweed.environment(), {**SETTINGS, 'events.post_s': 60.0})
     publisher = publisher_of(processes)

@@ -77,7 +77,7 @@ def wired(shared: Processes, seaweed: Tower, wire: Wire) -> Talk:
         pytest.param((403, 'RequestTimeTooSkewed'), 'the clocks of this machine and of', id='wrong clock', marks=MORE),
     ],
 )
-def test_a_store_that_fails_and_recovers(
+def test_everything_is_delivered_after_the_store_recovers(
     wired: Talk, wire: Wire, shared: Processes, stored: Callable[..., Objects], mode: str | tuple[int, str], words: str
 ) -> None:
     """Each fault has a message of its own; what is published meanwhile waits, and is delivered when the fault is gone."""
@@ -100,7 +100,7 @@ def test_a_store_that_fails_and_recovers(
 
 
 @pytest.mark.long('a Tower of its own')
-def test_a_server_that_is_not_there_yet(processes: Processes, tmp_path: Path) -> None:
+def test_objects_wait_for_a_server_that_starts_later(processes: Processes, tmp_path: Path) -> None:
     """A node that is started before its server delivers once the server is started."""
     with Tower(tmp_path / 'tower') as late, closing(S3Store(late.store_settings(), UploadSettings())) as store:
         late.stop_s3()
@@ -113,7 +113,9 @@ def test_a_server_that_is_not_there_yet(processes: Processes, tmp_path: Path) ->
         talking.delivered(lambda: Objects.of(store, 'sensor-data', processes.robot))
 
 
-def test_a_wrong_secret(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+def test_a_wrong_secret_pauses_delivery_and_is_not_shown(
+    processes: Processes, seaweed: Tower, stored: Callable[..., Objects]
+) -> None:
     """A real server's refusal pauses delivery and names the variables, never the secret; a right secret delivers all."""
     wrong = {**seaweed.environment(), 'AWS_SECRET_ACCESS_KEY': 'not-the-secret'}
     talking = talk(processes, wrong)
@@ -126,7 +128,7 @@ def test_a_wrong_secret(processes: Processes, seaweed: Tower, stored: Callable[.
     assert stored(processes.robot).numbers('talk') == list(range(COUNT))
 
 
-def test_a_bucket_that_is_missing_is_made(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+def test_a_missing_bucket_is_created(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """Where the credentials allow it, the bucket is created, and the log says so."""
     bucket = f'fresh-{processes.robot}'
     talking = talk(processes, seaweed.environment(), **{'talk.bucket': bucket})
@@ -147,7 +149,9 @@ def owner(seaweed: Tower) -> Iterator[Any]:
     client.close()
 
 
-def test_a_bucket_that_cannot_be_made(processes: Processes, seaweed: Tower, owner: Any, stored: Callable[..., Objects]) -> None:
+def test_a_bucket_that_cannot_be_created_blocks_only_its_objects(
+    processes: Processes, seaweed: Tower, owner: Any, stored: Callable[..., Objects]
+) -> None:
     """Where they do not, the error says how to create it; its objects wait and are delivered once it is there."""
     talking = talk(processes, seaweed.environment('limited'), **{'talk.bucket': 'later'})
     talking.publish()

@@ -131,7 +131,7 @@ def message(name: str, value: Any) -> ParameterMessage:
     return found.to_parameter_msg()
 
 
-def test_each_parameter_is_judged_as_by_the_node(stations: dict[str, Station]) -> None:
+def test_each_parameter_is_checked_as_by_the_node(stations: dict[str, Station]) -> None:
     """Set alone and together, with the same reasons, and what they are afterwards is the same."""
     for name, value in VALUES:
         request = SetParameters.Request(parameters=[message(name, value)])
@@ -192,7 +192,7 @@ def test_the_front_publishes_the_nodes_state(nodes: dict[str, Node], stations: d
     assert all(isinstance(pair.value, str) for entry in heard.values() for pair in entry.values)
 
 
-def test_whom_the_robot_finds_is_compared_by_a_front_alone(nodes: dict[str, Node]) -> None:
+def test_only_a_front_compares_publishers(nodes: dict[str, Node]) -> None:
     """A node that listens through the RMW of the robot compares nothing, and says that it does not."""
 
     def undiscovered(space: str) -> Any:
@@ -226,7 +226,7 @@ def test_the_front_publishes_missions(nodes: dict[str, Node], stations: dict[str
 
 
 @pytest.mark.long('kills')
-def test_a_front_that_dies_is_started_again(shared: Processes, nodes: dict[str, Node], stations: dict[str, Station]) -> None:
+def test_a_front_that_exits_is_restarted(shared: Processes, nodes: dict[str, Node], stations: dict[str, Station]) -> None:
     """The node goes on meanwhile, loses nothing, and says what happened."""
     node, publisher = nodes[BESIDE], shared.publisher()
     publisher.create(f'{BESIDE}/talk', STRING)
@@ -260,7 +260,7 @@ def test_the_front_ends_with_the_node(processes: Processes) -> None:
     assert 'front failed' not in again.log
 
 
-def test_the_name_and_the_rules_of_the_command_line_hold(processes: Processes) -> None:
+def test_name_and_remappings_of_the_command_line_apply_to_the_front(processes: Processes) -> None:
     """Another name, rules and parameters for that name alone: the front has the name, and the node goes by all of them."""
     node = processes.node(
         None, SENSORS, '-r', '__node:=mine', '-r', 'mine:talk:=heard', '-p', 'mine:talk.priority:=2', program=FRONTED

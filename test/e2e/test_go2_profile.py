@@ -27,7 +27,7 @@ KEYS = {
 pytestmark = pytest.mark.timeout(300 + 2 * DURATION_S)
 
 
-def test_default_profile_is_accounted_for(session: Session) -> None:
+def test_the_default_profile_is_accounted_for(session: Session) -> None:
     """Every topic is accounted exactly, nothing is missed, dropped, rejected or open, and all of it is delivered."""
     assert session.ledger['balanced']
     assert set(session.ledger['topics']) == set(TYPES)
@@ -38,7 +38,7 @@ def test_default_profile_is_accounted_for(session: Session) -> None:
     assert objects['delivered'] == objects['spooled']
 
 
-def test_default_profile_counts_what_the_robot_counted(session: Session) -> None:
+def test_the_default_profile_counts_what_the_robot_published(session: Session) -> None:
     """The robot's own count of each topic is the ledger's, from the first message on."""
     counted = 'published' if session.node.hears_numbers else 'received'
     assert {topic: row[counted] for topic, row in session.ledger['topics'].items()} == {
@@ -46,7 +46,7 @@ def test_default_profile_counts_what_the_robot_counted(session: Session) -> None
     }
 
 
-def test_default_profile_in_the_store_is_what_is_stored(session: Session) -> None:
+def test_the_store_has_what_the_ledger_states(session: Session) -> None:
     """The samples inside the objects of the store are as many as the ledger calls stored."""
     assert session.objects.counted() == {topic: row['stored'] for topic, row in session.ledger['topics'].items()}
     for name in ('imu', 'states', 'joints', 'lowstate'):
@@ -54,7 +54,7 @@ def test_default_profile_in_the_store_is_what_is_stored(session: Session) -> Non
         assert len(session.objects.samples(name)) == session.ledger['topics'][topic]['stored']
 
 
-def test_default_profile_keys(session: Session) -> None:
+def test_objects_have_the_documented_keys(session: Session) -> None:
     """Objects have the documented keys, in the UTC second of their first sample, and a type and hash."""
     for key, info in session.objects.infos.items():
         sensor = key.split('/')[1]
@@ -68,7 +68,7 @@ def test_default_profile_keys(session: Session) -> None:
 
 
 @pytest.mark.parametrize('topic', EVERY_MESSAGE)
-def test_default_profile_every_sample_is_there(session: Session, topic: str) -> None:
+def test_every_sample_is_in_the_store(session: Session, topic: str) -> None:
     """Of a topic without downsampling every message is in the store, once, under its own time."""
     stamps = [sample['stamp_ns'] for sample in session.objects.samples(SENSORS[topic])]
     assert sorted(stamps) == sorted(session.by_stamp[topic])
@@ -76,14 +76,14 @@ def test_default_profile_every_sample_is_there(session: Session, topic: str) -> 
 
 
 @pytest.mark.parametrize('topic', ['/imu', '/go2_states', '/joint_states', '/lowstate'])
-def test_default_profile_batches_are_what_was_published(session: Session, topic: str) -> None:
+def test_batches_are_as_published(session: Session, topic: str) -> None:
     """Every field of every sample is the published one, floats bit for bit."""
     for sample in session.objects.samples(SENSORS[topic]):
         assert_same(sample, session.decoded(topic, sample['stamp_ns']), TYPES[topic], topic)
 
 
 @pytest.mark.parametrize('topic', ['/camera/compressed', '/point_cloud2', '/odom', '/lowstate'])
-def test_default_profile_keeps_the_first_of_each_second(session: Session, topic: str) -> None:
+def test_the_first_message_of_each_second_is_kept(session: Session, topic: str) -> None:
     """At 1 Hz the first message of each whole second of UTC is kept, and no other."""
     firsts: dict[int, int] = {}
     for stamp in sorted(session.by_stamp[topic]):
@@ -96,7 +96,7 @@ def test_default_profile_keeps_the_first_of_each_second(session: Session, topic:
     assert sorted(kept) == sorted(firsts.values())
 
 
-def test_default_profile_images_are_what_was_published(session: Session) -> None:
+def test_images_are_as_published(session: Session) -> None:
     """A camera object is the published JPEG, byte for byte."""
     images = session.objects.sensor('camera')
     assert len(images) >= DURATION_S
@@ -105,7 +105,7 @@ def test_default_profile_images_are_what_was_published(session: Session) -> None
         assert body == bytes(session.decoded('/camera/compressed', stamp).data)
 
 
-def test_default_profile_clouds_are_what_was_published(session: Session) -> None:
+def test_clouds_are_as_published(session: Session) -> None:
     """A cloud reads back, by another library, with the published points bit for bit."""
     clouds = session.objects.sensor('lidar')
     assert len(clouds) >= DURATION_S
@@ -117,7 +117,7 @@ def test_default_profile_clouds_are_what_was_published(session: Session) -> None
         assert np.stack([cloud.pc_data[name] for name in cloud.fields], axis=1).tobytes() == points.tobytes()
 
 
-def test_default_profile_odometry_is_what_was_published(session: Session) -> None:
+def test_odometry_is_as_published(session: Session) -> None:
     """An odometry record has the published pose and twist, and its time in words."""
     records = session.objects.documents('odom')
     assert len(records) >= DURATION_S
@@ -131,7 +131,7 @@ def test_default_profile_odometry_is_what_was_published(session: Session) -> Non
         assert datetime.fromisoformat(record['timestamp'].replace('Z', '+00:00')).timestamp() == record['stamp_ns'] // 1000 / 1e6
 
 
-def test_default_profile_calibration_is_kept_once(session: Session) -> None:
+def test_calibration_is_kept_once(session: Session) -> None:
     """A calibration that never changes is stored once, as published."""
     (record,) = session.objects.documents('camera_info')
     message = session.decoded('/camera/camera_info', record['stamp_ns'])

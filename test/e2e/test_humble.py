@@ -117,7 +117,7 @@ def humble(folder: Path, rmw: str) -> dict[str, str]:
         (CYCLONE_DDS, {'estimated', 'received-only'}),
     ],
 )
-def test_all_is_stored_and_what_is_not_known_is_null(
+def test_everything_is_stored_and_unknown_counts_are_null(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects], tmp_path: Path, rmw: str, grades: set[str]
 ) -> None:
     """Of one and of two publishers and from their history, each message once; the accounts claim what they know and no more."""
@@ -160,7 +160,7 @@ def test_all_is_stored_and_what_is_not_known_is_null(
 
 
 @newer
-def test_what_is_hidden_is_hidden_from_our_package_alone(tmp_path: Path) -> None:
+def test_names_are_hidden_from_this_package_alone(tmp_path: Path) -> None:
     """What Humble has is there, what came later is not; rclpy's own modules go on using it."""
     environ = {**os.environ, **humble(tmp_path / 'humble', FAST_DDS)}
     for name, expected in (

@@ -36,7 +36,9 @@ def publish(publishers: dict[str, Publisher]) -> None:
         list(pool.map(lambda name: publishers[name].publish(f'{NS}/{name}', messages(name), 1 / (SENT[name][1] or 1.0)), SENT))
 
 
-def test_its_file_logs_the_robot(shared: Processes, publishers: dict[str, Publisher], seaweed: Tower, tmp_path: Path) -> None:
+def test_the_file_that_init_writes_logs_the_robot(
+    shared: Processes, publishers: dict[str, Publisher], seaweed: Tower, tmp_path: Path
+) -> None:
     """Rates, sizes and what is left out are in comments; a node with the file receives and stores what is published then."""
     path = tmp_path / 'robot.yaml'
     with ThreadPoolExecutor(1) as pool:
@@ -74,7 +76,7 @@ def test_its_file_logs_the_robot(shared: Processes, publishers: dict[str, Publis
         assert account['received'] == account['stored'] + account['skipped'], (name, account)
 
 
-def test_nothing_is_found(shared: Processes) -> None:
+def test_without_topics_init_reports_an_error(shared: Processes) -> None:
     """It says so, and that is a finding; for programs as well."""
     ran = init(shared, '--namespace', '/nobody', '--duration', '1')
     assert ran.returncode == 1

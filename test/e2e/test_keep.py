@@ -66,7 +66,7 @@ def patrols(processes: Processes, node: Node) -> None:
 @pytest.mark.slow
 @pytest.mark.long('a robot, a node, a Tower with MLflow, and half a dozen commands')
 @pytest.mark.timeout(900)
-def test_patrol_look_pull_and_train(  # noqa: PLR0915 - one story
+def test_the_commands_of_the_page_on_keeping_data_work(  # noqa: PLR0915 - one story
     processes: Processes, tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the settings of the page its commands do what it says, one after the other."""

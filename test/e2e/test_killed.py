@@ -70,7 +70,7 @@ def lost(published_ns: list[int], stored_ns: set[int]) -> list[tuple[float, floa
 
 
 @pytest.mark.long('kills under load')
-def test_kill_and_restart_under_load(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+def test_a_kill_under_load_makes_one_short_gap(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """The ledger balances and knows of each message; a kill makes one gap, no longer than the restart and 1.25 s."""
     environ = seaweed.environment()
     node = processes.node(environ)

@@ -28,7 +28,7 @@ def latched(bag: Bag) -> list[tuple[str, str]]:
 
 
 @pytest.mark.long('twelve seconds of bags')
-def test_what_is_latched_is_at_the_start_of_every_bag(
+def test_latched_messages_are_at_the_start_of_every_bag(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:
     """The last message of both publishers of a topic, and of one that a sensor takes too; nothing of it counts as missed."""

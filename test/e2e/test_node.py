@@ -45,7 +45,7 @@ def test_a_signal_closes_the_open_batches(
     assert stored(processes.robot).numbers('talk') == list(range(COUNT))
 
 
-def test_systemd_knows_how_it_is(processes: Processes, seaweed: Tower, tmp_path: Path) -> None:
+def test_systemd_is_notified_of_the_state(processes: Processes, seaweed: Tower, tmp_path: Path) -> None:
     """As a service it says when it is ready, that it lives, and that it stops."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / 'notify'))
@@ -60,9 +60,7 @@ def test_systemd_knows_how_it_is(processes: Processes, seaweed: Tower, tmp_path:
             said.append(systemd.recv(1000))
 
 
-def test_what_is_left_is_delivered_by_the_next_start(
-    processes: Processes, seaweed: Tower, stored: Callable[..., Objects]
-) -> None:
+def test_the_next_start_delivers_the_rest(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
     """A stop while the store is away keeps everything in the spool, and says so; the next start delivers it."""
     with Wire(seaweed.endpoint_url) as wire:
         wire.set((500, 'InternalError'))
@@ -143,7 +141,7 @@ def test_a_wrong_parameter_refuses_the_start(processes: Processes, parameters: d
     assert not (node.home / 'spool').exists()
 
 
-def test_an_invalid_parameter_file(processes: Processes) -> None:
+def test_an_invalid_parameter_file_refuses_the_start(processes: Processes) -> None:
     """A parameter file that cannot be read refuses the start as well, without a traceback."""
     node = processes.node(None, {}, '--params-file', '/nonexistent.yaml', ready=False)
     assert node.wait() == 2, node.log
@@ -181,7 +179,7 @@ HIDE_GO2 = "import sys\nsys.modules['go2_interfaces'] = None\n"
 
 
 @pytest.mark.long('a node of its own')
-def test_go2_interfaces_is_not_installed(processes: Processes, tmp_path: Path) -> None:
+def test_without_go2_interfaces_only_its_topics_are_affected(processes: Processes, tmp_path: Path) -> None:
     """Its topics cost one warning each, and the others go on."""
     (tmp_path / 'hidden').mkdir()
     (tmp_path / 'hidden' / 'sitecustomize.py').write_text(HIDE_GO2)
@@ -216,7 +214,9 @@ def cloud(points: list[tuple[float, float, float]], **layout: int) -> bytes:
     return stamped('sensor_msgs/msg/PointCloud2', fields=fields, data=data, **layout)
 
 
-def test_malformed_messages(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
+def test_malformed_messages_are_rejected_and_counted(
+    processes: Processes, seaweed: Tower, stored: Callable[..., Objects]
+) -> None:
     """What cannot be read is rejected by reason and counted, what has no encoder is stored as serialized, under its true date."""
     jpeg, image = 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image'
     good = simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8))
@@ -253,7 +253,7 @@ def test_malformed_messages(processes: Processes, seaweed: Tower, stored: Callab
     assert not [key for key in objects.contents if '/1970' in key], 'a header stamp of 1970 is not believed'
 
 
-def test_a_message_that_is_cut_short(processes: Processes) -> None:
+def test_a_truncated_message_is_rejected(processes: Processes) -> None:
     """Bytes that are not a message of the topic's type are rejected as malformed."""
     node, publisher = processes.node(None, {**TALK, 'talk.batch_s': 0.0}), processes.publisher()
     publisher.create('/talk', STRING)

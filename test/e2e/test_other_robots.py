@@ -40,7 +40,7 @@ FIELDS: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 
 
-def test_every_type_that_has_a_rule(processes: Processes) -> None:
+def test_every_type_with_a_rule_is_logged(processes: Processes) -> None:
     """Each message of it is stored or left out by the rate, and none is rejected."""
     kinds = [kind for kind in RULES if not is_of_unitree(kind) and find_spec(kind.partition('/')[0])]
     assert len(kinds) > 50
@@ -70,7 +70,7 @@ def test_a_wheeled_base(processes: Processes, browser: Browser, tmp_path: Path) 
     assert features['action']['names'] == ['x.vel', 'theta.vel']
 
 
-def test_a_drone(processes: Processes, browser: Browser, tmp_path: Path) -> None:
+def test_a_drone_is_logged_with_its_gps(processes: Processes, browser: Browser, tmp_path: Path) -> None:
     """In a namespace: its name, its GPS in each object, and --near-gps finds what it recorded there."""
     robot = Robot(processes, DRONE, '-r', '__ns:=/drone1', robot='', mission='drone1')
     with robot.walking():
@@ -101,7 +101,7 @@ def test_a_drone(processes: Processes, browser: Browser, tmp_path: Path) -> None
     assert features['observation.state']['names'] == ['latitude', 'longitude', 'altitude']
 
 
-def test_an_arm(processes: Processes, browser: Browser, tmp_path: Path) -> None:
+def test_an_arm_is_logged_without_a_place(processes: Processes, browser: Browser, tmp_path: Path) -> None:
     """Joints, the camera at its wrist, its description and its commands; it has no place, and so it is drawn at the origin."""
     robot = Robot(processes, ARM, robot='ur5', mission='ur5')
     with robot.walking():
@@ -143,7 +143,7 @@ def assert_logs_itself_alone(robot: Robot, ledger: Mapping[str, Any]) -> None:
 
 
 @pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')
-def test_a_unitree_with_its_own_topics(processes: Processes, browser: Browser, tmp_path: Path) -> None:
+def test_a_unitree_is_logged_from_its_own_topics(processes: Processes, browser: Browser, tmp_path: Path) -> None:
     """Through Cyclone DDS, without the driver: the sensors of a Go2 are taken from them, and the battery is known.
 
     Messages of unitree_go need the package; without it the log says how to build it, and all else is stored.
@@ -172,7 +172,7 @@ def test_a_unitree_with_its_own_topics(processes: Processes, browser: Browser, t
     assert 'image' in refused, refused
 
 
-def test_two_robots_in_one_graph(processes: Processes) -> None:
+def test_two_robots_in_one_graph_are_logged_separately(processes: Processes) -> None:
     """A node in the namespace of each logs that robot alone, under its name; one without says what to start instead."""
     names, kinds = ('robot0', 'robot1'), {'odom': 'nav_msgs/msg/Odometry', 'imu': 'sensor_msgs/msg/Imu',
                                           'joint_states': 'sensor_msgs/msg/JointState'}  # fmt: skip

@@ -1,6 +1,6 @@
 """Publishers in processes of their own, a node and a store: all they send after the match is stored, and once.
 
-Publishers of every kind, in the test's own process, are in test/node/test_publishers.py.
+Publishers of every kind, in the test's own process, are in test/node/intake/test_intake.py.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def listening(shared: Processes, seaweed: Tower, stored: Callable[..., Objects])
 
 
 @pytest.mark.long('kills')
-def test_a_publisher_that_is_killed_and_starts_again(listening: Listening) -> None:
+def test_a_publisher_is_counted_across_a_kill_and_restart(listening: Listening) -> None:
     """The messages of both of its lives are stored once."""
     for life in range(2):
         publisher = listening.processes.publisher()
@@ -60,7 +60,7 @@ def test_a_publisher_that_is_killed_and_starts_again(listening: Listening) -> No
     assert listening.numbers('killed', 2 * COUNT + 2) == list(range(2 * COUNT))
 
 
-def test_two_publishers_on_a_topic(listening: Listening) -> None:
+def test_two_publishers_on_a_topic_are_stored_once(listening: Listening) -> None:
     """The messages of both are stored once, where one is BEST_EFFORT and the other RELIABLE."""
     both = [listening.processes.publisher() for _ in range(2)]
     for publisher, reliable in zip(both, (False, True), strict=True):

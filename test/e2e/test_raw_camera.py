@@ -65,7 +65,7 @@ def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored:
 
 @pytest.mark.slow
 @pytest.mark.long('a minute of raw images')
-def test_a_minute_of_raw_images(processes: Processes, seaweed: Tower) -> None:
+def test_a_minute_of_raw_images_is_accounted_for(processes: Processes, seaweed: Tower) -> None:
     """Of 1,800 raw images the node receives all but what a machine that is busy with other tests loses, and counts that."""
     node = processes.node(seaweed.environment(), {'sensors': ['camera']})
     sim = processes.sim('compressed:=false', 'duration_s:=60.0')

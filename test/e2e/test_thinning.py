@@ -44,7 +44,7 @@ def thins(root: Path, more: int) -> None:
 @pytest.mark.slow
 @pytest.mark.long('a robot for a minute, and six kills')
 @pytest.mark.timeout(900)
-def test_rate_goes_before_time(processes: Processes) -> None:
+def test_kept_data_is_thinned_before_the_oldest_is_evicted(processes: Processes) -> None:
     """Killed again and again while it thins: nothing is evicted as a whole, each second stays, the ledger has every message."""
     chance = random.Random(28)
     processes.sim('image_raw:=false')

@@ -67,7 +67,7 @@ def mortal(processes: Processes, tmp_path: Path) -> Mortal:
 
 
 @pytest.mark.long('kills threads')
-def test_each_thread_dies_and_nothing_is_lost(mortal: Mortal) -> None:
+def test_nothing_is_lost_when_any_thread_fails(mortal: Mortal) -> None:
     """Twice each: of what its round raised, and of its own bookkeeping; in the end every message is delivered."""
     sent, seen_s = 0, [mortal.seen_after_s('upload-lock', 'thread', 1)]
     for failures, way in enumerate(('round', 'thread'), 1):
@@ -89,7 +89,7 @@ def test_each_thread_dies_and_nothing_is_lost(mortal: Mortal) -> None:
 
 
 @pytest.mark.long('kills threads')
-def test_the_main_loop_dies(mortal: Mortal) -> None:
+def test_a_failure_of_the_main_loop_ends_the_node(mortal: Mortal) -> None:
     """The node does not go on without it: it makes all durable, says why and ends with 1, and its service starts it again."""
     mortal.publisher.publish('/talk', texts(range(GROUP)))
     mortal.node.received('/talk', GROUP)

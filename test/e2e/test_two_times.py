@@ -87,7 +87,7 @@ def test_publishers_on_different_clocks_are_sampled_separately(objects: Objects)
 
 
 @pytest.mark.long('publishers with clocks of their own')
-def test_a_batch_per_second_whatever_the_clock(objects: Objects) -> None:
+def test_wrong_stamps_do_not_split_batches(objects: Objects) -> None:
     """A constant offset, and a stamp that is stuck, do not break a topic into single messages."""
     for name in ('late', 'ahead', 'fine', 'stuck'):
         assert SECONDS - 1 <= len(objects.sensor(name)) <= SECONDS + 3, name

@@ -39,7 +39,7 @@ def started(processes: Processes, folder: Path, sensors: list[str], expected_hz:
 
 
 @pytest.mark.long('seven seconds of a topic without a rhythm')
-def test_without_a_rhythm_nothing_is_claimed(processes: Processes, tmp_path: Path) -> None:
+def test_without_a_rhythm_losses_are_unknown(processes: Processes, tmp_path: Path) -> None:
     """Each message is counted once, also where a history is delivered that two subscriptions hear; what was missed is null."""
     node, publisher = started(processes, tmp_path, ['plain', 'latched'], 0.0), processes.publisher()
     publisher.create('/plain', STRING)
@@ -55,7 +55,7 @@ def test_without_a_rhythm_nothing_is_claimed(processes: Processes, tmp_path: Pat
 
 
 @pytest.mark.long('a kill')
-def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None:
+def test_losses_are_estimated_from_the_rhythm(processes: Processes, tmp_path: Path) -> None:
     """By the rate of a publisher that goes on while the node is stopped, and while it is dead: to 5 %, and marked as such."""
     for name in ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE'):
         processes.environ.pop(name, None)
@@ -87,7 +87,7 @@ def test_what_is_lost_is_estimated(processes: Processes, tmp_path: Path) -> None
 
 
 @pytest.mark.long('nine seconds of a topic')
-def test_what_a_dead_publisher_did_not_publish_is_not_lost(processes: Processes, tmp_path: Path) -> None:
+def test_messages_that_a_dead_publisher_did_not_publish_are_not_lost(processes: Processes, tmp_path: Path) -> None:
     """One that is killed, and another one in its place two seconds later: the gap between them is nobody's loss."""
     node = started(processes, tmp_path, ['calm'])
     for _ in range(2):

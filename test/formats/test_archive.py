@@ -67,7 +67,7 @@ def pack(ros: Any, type_name: str, *cdrs: bytes, format_name: str, **changes: An
 
 
 @ARCHIVES
-def test_a_second_of_frames(ros: Any, format_name: str) -> None:
+def test_an_archive_has_each_frame_and_its_description(ros: Any, format_name: str) -> None:
     """Each frame is there byte for byte, and its JSON says when, where from and how large it is."""
     frames = [jpeg(shade) for shade in (10, 100, 200)]
     encoding = pack(ros, COMPRESSED, *(frame(ros, data) for data in frames), format_name=format_name)
@@ -84,7 +84,7 @@ def test_a_second_of_frames(ros: Any, format_name: str) -> None:
 
 
 @pytest.mark.parametrize(('format_name', 'content_type'), [('zip', 'application/zip'), ('tar', 'application/x-tar')])
-def test_the_object(ros: Any, format_name: str, content_type: str) -> None:
+def test_an_archive_is_an_object_of_its_sensor(ros: Any, format_name: str, content_type: str) -> None:
     """The archive has the sensor's key with its own extension, and the metadata of every object."""
     made = pack(ros, COMPRESSED, frame(ros, jpeg(1)), frame(ros, jpeg(2)), format_name=format_name).object
     assert (made.key, made.content_type) == (f'thor/camera/20251018/120000_front.{format_name}', content_type)
@@ -93,7 +93,7 @@ def test_the_object(ros: Any, format_name: str, content_type: str) -> None:
 
 
 @ARCHIVES
-def test_what_each_type_becomes(ros: Any, format_name: str) -> None:
+def test_each_type_has_its_file_in_the_archive(ros: Any, format_name: str) -> None:
     """Raw images are JPEG or, where they are depth, PNG; clouds are PCD; everything else is CDR, with header or without."""
     pixels = {'height': 2, 'width': 2, 'data': np.zeros(12, np.uint8), 'step': 6, 'header': HEADER}
     field = ros.make('sensor_msgs/msg/PointField', name='x', datatype=7, count=1)
@@ -120,7 +120,7 @@ def test_what_each_type_becomes(ros: Any, format_name: str) -> None:
 
 
 @ARCHIVES
-def test_the_order_of_time(ros: Any, format_name: str) -> None:
+def test_files_are_sorted_by_time(ros: Any, format_name: str) -> None:
     """Samples are sorted by time however they came; of two with one stamp the second is numbered, so that none is lost."""
     stamps = [STAMP_NS + 5, STAMP_NS, STAMP_NS + 5, STAMP_NS + 3, STAMP_NS + 5]
     cdrs = [frame(ros, jpeg(shade)) for shade in range(5)]
@@ -163,7 +163,7 @@ def test_the_same_batch_gives_the_same_bytes(ros: Any, format_name: str, stamp_n
         assert datetime.fromtimestamp(mtime, timezone.utc) == datetime(2025, 10, 18, 12, tzinfo=timezone.utc)
 
 
-def test_the_files_are_plain(ros: Any) -> None:
+def test_the_files_are_plain_files(ros: Any) -> None:
     """A tar is ustar without extensions, a zip is stored and not compressed; both unpack to files that can be read."""
     cdr = frame(ros, jpeg(1))
     tar = pack(ros, COMPRESSED, cdr, format_name='tar').object.body

@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.formats.types import CounterField, MessageTypes, header_frame_id, header_stamp_ns
 
 pytest.importorskip('rclpy')
-from formats.test_against_rclpy import plain
+from formats.test_types import plain
 from rclpy.serialization import deserialize_message, serialize_message
 
 pytestmark = pytest.mark.ros
@@ -127,7 +127,7 @@ def check(types: MessageTypes, type_name: str, cdr: bytes) -> None:
 
 @pytest.mark.parametrize('type_name', TYPES)
 @pytest.mark.parametrize('form', [{}, {'nul': False}, {'order': '>'}, {'nul': False, 'order': '>'}], ids=str)
-def test_reads_as_rclpy_does(types: MessageTypes, type_name: str, form: dict[str, Any]) -> None:
+def test_cdr_is_read_like_rclpy_does(types: MessageTypes, type_name: str, form: dict[str, Any]) -> None:
     """Random messages of every kind of field read as rclpy reads them: without NULs, big-endian, and padded."""
     rclpy_class(type_name)
     for seed in range(20):
@@ -138,7 +138,7 @@ def test_reads_as_rclpy_does(types: MessageTypes, type_name: str, form: dict[str
 
 @pytest.mark.parametrize('type_name', TYPES)
 @pytest.mark.parametrize('order', ['<', '>'])
-def test_reads_xcdr2(types: MessageTypes, type_name: str, order: str) -> None:
+def test_xcdr2_is_read(types: MessageTypes, type_name: str, order: str) -> None:
     """XCDR2 of final types, which rclpy cannot read in general, has the values that the same message has in CDR."""
     rclpy_class(type_name)
     for seed in range(20):
@@ -148,7 +148,7 @@ def test_reads_xcdr2(types: MessageTypes, type_name: str, order: str) -> None:
 
 
 @pytest.mark.parametrize('is_xcdr2', [False, True])
-def test_reads_what_cyclone_dds_writes(types: MessageTypes, is_xcdr2: bool) -> None:
+def test_messages_of_cyclone_dds_are_read(types: MessageTypes, is_xcdr2: bool) -> None:
     """A message of an application of Cyclone DDS without ROS is read, in CDR and in XCDR2."""
     pytest.importorskip('cyclonedds')
     from formats.cyclone import Header, JointState, Time
@@ -160,7 +160,7 @@ def test_reads_what_cyclone_dds_writes(types: MessageTypes, is_xcdr2: bool) -> N
 
 
 @pytest.mark.parametrize('type_name', TYPES)
-def test_reads_what_rclpy_writes(types: MessageTypes, type_name: str) -> None:
+def test_messages_of_rclpy_are_read(types: MessageTypes, type_name: str) -> None:
     """Random messages read the same after rclpy has written them once more, with as many bytes as it adds."""
     kind = rclpy_class(type_name)
     for seed in range(60):
@@ -173,7 +173,7 @@ def test_reads_what_rclpy_writes(types: MessageTypes, type_name: str) -> None:
     (struct.pack('<I', 1) + b'\0', ''), (struct.pack('<I', 2) + b'\xff\0', '\ufffd'), (struct.pack('<I', 1) + b'\xff', '\ufffd'),
 ])  # fmt: skip
 @pytest.mark.parametrize('padding', range(5))
-def test_strings(types: MessageTypes, body: bytes, text: str, padding: int) -> None:
+def test_unusual_strings_are_read(types: MessageTypes, body: bytes, text: str, padding: int) -> None:
     """A string may lack its NUL, have the length 0, not be UTF-8, and be followed by up to four bytes."""
     cdr = b'\0\1\0\0' + body + bytes(padding)
     assert types.deserialize(STRING, cdr).data == text == deserialize_message(cdr, rclpy_class(STRING)).data
@@ -193,7 +193,7 @@ def test_text_after_a_nul_is_kept(types: MessageTypes) -> None:
       for kind in (2, 3, 4, 5, 8, 9, 10, 11, 12)),
     (b'\1\1\0\0' + struct.pack('<I', 6) + b'hello\0', 'not the encapsulation'),
 ])  # fmt: skip
-def test_what_is_no_message(types: MessageTypes, cdr: bytes, why: str) -> None:
+def test_bytes_that_are_not_a_message_are_rejected(types: MessageTypes, cdr: bytes, why: str) -> None:
     """Too many bytes, too few, and encapsulations with headers in front of members are malformed, with what is wrong."""
     with pytest.raises(Rejected, match=why) as rejected:
         types.deserialize(STRING, cdr)
@@ -201,7 +201,7 @@ def test_what_is_no_message(types: MessageTypes, cdr: bytes, why: str) -> None:
 
 
 @pytest.mark.parametrize('type_name', TYPES)
-def test_damage(types: MessageTypes, type_name: str) -> None:
+def test_a_damaged_message_is_read_like_rclpy_or_rejected(types: MessageTypes, type_name: str) -> None:
     """A damaged message is read as rclpy reads it, or rejected as malformed."""
     rclpy_class(type_name)
     for seed in range(60):
@@ -245,7 +245,7 @@ def cut(value: Any) -> Any:
 
 
 @pytest.mark.parametrize('kind', [0, 1, 6, 7])
-def test_a_header_without_nul(kind: int) -> None:
+def test_a_header_without_nul_is_read(kind: int) -> None:
     """Stamp and frame of a header are read in each encapsulation, also without the NUL."""
     order = '<' if kind & 1 else '>'
     for text in (b'odom', b'odom\0'):
@@ -253,7 +253,7 @@ def test_a_header_without_nul(kind: int) -> None:
         assert (header_stamp_ns(cdr), header_frame_id(cdr)) == (5_000_000_007, 'odom')
 
 
-def test_a_counter_of_another_alignment_is_unknown() -> None:
+def test_a_counter_at_another_alignment_is_unknown() -> None:
     """The place of a counter is that of CDR; of XCDR2 nothing is claimed."""
     field = CounterField(4, struct.Struct('<I'), struct.Struct('>I'))
     assert [field.read(bytes([0, kind, 0, 0, 0, 0, 0, 1])) for kind in (0, 6)] == [1, 0]

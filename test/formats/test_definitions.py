@@ -35,7 +35,7 @@ def parsed(idl: str) -> Any:
     return found
 
 
-def test_every_type_it_uses_follows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_definition_includes_every_nested_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """rosbag2's order: each type before those it uses, these by name, none twice, a line and `MSG:` above each but the first."""
     files = {
         'zoo/Cage.msg': '# a cage\nAnimal[] animals\nstring<=10 label\nfood/Meal meal 1\nuint8 BIG=1\n',
@@ -52,7 +52,7 @@ def test_every_type_it_uses_follows(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ]), '')  # fmt: skip
 
 
-def test_idl_where_there_is_no_msg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idl_is_used_where_there_is_no_msg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A package with .idl alone is described by that, its own title above it as well, in a form that `rosbags` parses."""
     include = '#include "zoo/msg/Animal.idl"\n'
     cage = 'module zoo { module msg { struct Cage { zoo::msg::Animal animal; }; }; };\n'
@@ -67,7 +67,7 @@ def test_idl_where_there_is_no_msg(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert MessageTypes([tmp_path]).deserialize('zoo/msg/Cage', b'\0\1\0\0\4\0\0\0').animal.legs == 4
 
 
-def test_the_hash_is_the_installed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_type_hash_is_that_of_the_installed_definition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The hash is that of the type itself, from its .json; a broken or missing one is not a hash."""
     told = {
         'type_hashes': [
@@ -98,12 +98,12 @@ def test_the_first_workspace_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize('name', ['nowhere/msg/Thing', 'no type', '', '../../etc/passwd', 'std_msgs/srv/X', 'a/b/c/d'])
-def test_an_unknown_definition(name: str) -> None:
+def test_an_unknown_type_has_an_empty_definition(name: str) -> None:
     """An unknown type has an empty definition, which readers take for none."""
     assert describe(name) == ('', '', '')
 
 
-def test_without_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_common_types_are_described_without_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     """If nothing is sourced, common types are described anyway."""
     monkeypatch.delenv('AMENT_PREFIX_PATH', raising=False)
     encoding, definition, type_hash = describe('sensor_msgs/msg/Imu')
@@ -136,7 +136,7 @@ DERIVED = [
 
 @pytest.mark.skipif(not HAS_ROS, reason='no messages are installed')
 @pytest.mark.parametrize('name', DERIVED)
-def test_parts_of_services_and_actions(name: str) -> None:
+def test_parts_of_services_and_actions_have_definitions(name: str) -> None:
     """The definition of an event or a feedback message gives the type hash that rosidl computed for it."""
     encoding, definition, type_hash = describe(name)
     if not encoding:
@@ -147,7 +147,7 @@ def test_parts_of_services_and_actions(name: str) -> None:
     assert type_hash in {store.hash_rihs01(name), ''}  # Humble has none
 
 
-def test_an_action_where_there_are_no_service_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_action_is_described_where_there_are_no_service_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On Humble, which has no service_msgs, feedback is defined, and events are not."""
     wash = 'module zoo { module action { struct Wash_Feedback { long wet; }; }; };\n'
     uuid = 'module unique_identifier_msgs { module msg { struct UUID { octet uuid[16]; }; }; };\n'

@@ -46,7 +46,7 @@ def header(body: bytes) -> dict[str, str]:
     return dict(line.split(' ', 1) for line in text.splitlines() if not line.startswith('#'))
 
 
-def test_a_plain_cloud(ros: Any) -> None:
+def test_a_cloud_is_stored_as_pcd(ros: Any) -> None:
     """The header follows PCD v0.7, the points are the cloud's own bytes, NaN among them."""
     points = xyzi()
     result = ros.encode(CLOUD, cloud(ros, XYZI, points.tobytes(), width=5, point_step=16))
@@ -72,7 +72,7 @@ def test_padding_is_removed(ros: Any) -> None:
     assert body.endswith(b'binary\n' + points.tobytes())
 
 
-def test_organized_with_padded_rows(ros: Any) -> None:
+def test_padded_rows_of_an_organized_cloud_are_removed(ros: Any) -> None:
     """Width and height survive, and the bytes at the end of each row do not get between the points."""
     points = xyzi(6).reshape(2, 3, 4)
     rows = np.hstack((points.reshape(2, -1).view(np.uint8), np.full((2, 8), 7, np.uint8)))
@@ -82,7 +82,7 @@ def test_organized_with_padded_rows(ros: Any) -> None:
 
 
 @pytest.mark.parametrize('little_endian_cdr', [True, False])
-def test_big_endian_points(ros: Any, little_endian_cdr: bool) -> None:
+def test_big_endian_points_are_swapped(ros: Any, little_endian_cdr: bool) -> None:
     """Values of a big-endian cloud are swapped, whichever endianness the message around them has."""
     points = xyzi()
     data = points.astype('>f4').tobytes()
@@ -90,7 +90,7 @@ def test_big_endian_points(ros: Any, little_endian_cdr: bool) -> None:
     assert ros.encode(CLOUD, cdr).object.body.endswith(b'binary\n' + points.tobytes())
 
 
-def test_fields_out_of_order(ros: Any) -> None:
+def test_fields_keep_the_order_of_their_names(ros: Any) -> None:
     """Fields keep the order in which the cloud names them, even where their offsets go the other way."""
     fields = [('b', 4, 7, 1), ('a', 0, 6, 1)]
     data = np.array([(1, 2.5), (3, 4.5)], [('a', '<u4'), ('b', '<f4')])
@@ -112,7 +112,7 @@ def test_packed_color_keeps_its_bits(ros: Any) -> None:
             assert ros.encode(CLOUD, cdr).object.body.endswith(b'binary\n' + data.tobytes())
 
 
-def test_what_the_header_cannot_hold_is_in_a_comment(ros: Any) -> None:
+def test_metadata_that_pcd_cannot_hold_is_in_a_comment(ros: Any) -> None:
     """Stamp, frame and density are in a comment line, and a hostile frame_id cannot break out of it."""
     frame = 'odom\nPOINTS 9\r\n"é' + 'x' * 500
     cdr = cloud(ros, XYZI, xyzi().tobytes(), width=5, point_step=16, header={'frame_id': frame}, is_dense=False)
@@ -154,7 +154,7 @@ def test_a_single_row_needs_no_row_step(ros: Any) -> None:
     ({'width': 6, 'height': 1, 'row_step': 0}, 'row_step'), ({'width': 6, 'height': 0, 'row_step': 96}, 'height'),
     ({'width': 6, 'height': 0, 'row_step': 0}, 'height'), ({'width': 0, 'height': 6, 'row_step': 0}, 'width'),
 ])  # fmt: skip
-def test_one_reading(ros: Any, shape: dict[str, Any], corrected: str, *, big: bool) -> None:
+def test_an_unambiguous_size_is_corrected_and_counted(ros: Any, shape: dict[str, Any], corrected: str, *, big: bool) -> None:
     """Where width, height and point_step account for every byte, the cloud is stored as those say, and counted as corrected."""
     points = xyzi(6)
     sent = points.astype('>f4' if big else '<f4').tobytes()
@@ -166,7 +166,7 @@ def test_one_reading(ros: Any, shape: dict[str, Any], corrected: str, *, big: bo
     assert made.object.metadata.get('corrected', '') == corrected
 
 
-def test_the_last_row_without_its_padding(ros: Any) -> None:
+def test_the_last_row_may_lack_its_padding(ros: Any) -> None:
     """Rows of a padded cloud are read by row_step, also if the padding of the last one was not sent."""
     points = xyzi(6).reshape(2, 3, 4)
     rows = np.hstack((points.reshape(2, -1).view(np.uint8), np.full((2, 8), 7, np.uint8))).tobytes()
@@ -176,7 +176,7 @@ def test_the_last_row_without_its_padding(ros: Any) -> None:
 
 
 @pytest.mark.parametrize('layout', ['packed', 'no row_step', 'padded'])
-def test_an_organized_cloud_of_padded_points(ros: Any, layout: str) -> None:
+def test_padded_points_of_an_organized_cloud_are_read(ros: Any, layout: str) -> None:
     """Points with bytes between their fields, NaN among them, come out the same whatever row_step says."""
     kind = np.dtype(
         {'names': ['x', 'y', 'z', 'ring'], 'formats': ['<f4', '<f4', '<f4', '<u2'], 'offsets': [0, 4, 8, 20], 'itemsize': 32}
@@ -199,7 +199,7 @@ def test_an_organized_cloud_of_padded_points(ros: Any, layout: str) -> None:
 
 
 @pytest.mark.parametrize('shape', [{'width': 0, 'height': 0}, {'width': 0, 'height': 1}, {'width': 7, 'height': 0}])
-def test_no_points_are_a_measurement(ros: Any, shape: dict[str, int]) -> None:
+def test_a_cloud_without_points_is_stored(ros: Any, shape: dict[str, int]) -> None:
     """An empty cloud says that nothing was seen: it is a PCD without points."""
     made = ros.encode(CLOUD, cloud(ros, XYZI, b'', point_step=16, **shape))
     assert (made.rejected, made.corrected, made.object.metadata['points']) == ({}, {}, '0')
@@ -207,7 +207,7 @@ def test_no_points_are_a_measurement(ros: Any, shape: dict[str, int]) -> None:
     assert statistics_of(made.object.key, made.object.body) == unpack_statistics(made.object.statistics)
 
 
-def test_fields_that_overlap(ros: Any) -> None:
+def test_overlapping_fields_are_all_stored(ros: Any) -> None:
     """Each of them is stored, as for a color that is named as a whole and by its bytes."""
     fields = [('x', 0, 7, 1), ('rgb', 4, 7, 1), ('b', 4, 2, 1), ('g', 5, 2, 1), ('r', 6, 2, 1)]
     data = np.float32(1.5).tobytes() + bytes([1, 2, 3, 0])
@@ -221,7 +221,7 @@ def test_fields_that_overlap(ros: Any) -> None:
     [('x\nPOINTS 1', 0, 7, 1)], [('', 0, 7, 1)], [('höhe', 0, 7, 1)], [('x' * 65, 0, 7, 1)],
     [(f'x{number}', 0, 7, 4) for number in range(5)],
 ], ids=str)  # fmt: skip
-def test_fields_that_a_pcd_cannot_hold(ros: Any, fields: list[Any]) -> None:
+def test_fields_that_pcd_cannot_hold_are_rejected(ros: Any, fields: list[Any]) -> None:
     """The message is stored as it was serialized, and its metadata says why."""
     cdr = cloud(ros, fields, xyzi().tobytes(), width=5, point_step=16)
     made = ros.encode(CLOUD, cdr)
@@ -251,7 +251,7 @@ def test_fields_that_a_pcd_cannot_hold(ros: Any, fields: list[Any]) -> None:
         ({'fields': [('x', 0, 7, 5)]}, 'malformed'),
     ],
 )
-def test_clouds_with_false_sizes(ros: Any, changes: dict[str, Any], reason: str) -> None:
+def test_clouds_with_false_sizes_are_rejected(ros: Any, changes: dict[str, Any], reason: str) -> None:
     """Sizes that contradict each other and fields that end outside the point are rejected, by reason."""
     values = {'fields': XYZI, 'data': xyzi().tobytes(), 'width': 5, 'point_step': 16} | changes
     result = ros.encode(CLOUD, cloud(ros, values.pop('fields'), values.pop('data'), **values))
@@ -261,7 +261,7 @@ def test_clouds_with_false_sizes(ros: Any, changes: dict[str, Any], reason: str)
 
 @settings(derandomize=True, deadline=None, max_examples=examples(120))
 @given(data=st.data())
-def test_any_layout(ros: Any, data: st.DataObject) -> None:
+def test_any_layout_reads_back(ros: Any, data: st.DataObject) -> None:
     """Any mix of datatypes, counts, gaps, order of fields, row padding and byte order reads back bit for bit."""
     shape = st.tuples(st.sampled_from(sorted(FORMATS)), st.integers(1, 3), st.integers(0, 5))
     columns = data.draw(st.lists(shape, min_size=1, max_size=6))
@@ -304,7 +304,7 @@ def test_a_cloud_has_its_number_of_points_and_their_bounds(ros: Any) -> None:
 
 @pytest.mark.parametrize('big', [False, True])
 @pytest.mark.parametrize(('row_step', 'pad'), [(48, 0), (0, 0), (96, 0), (60, 12)])
-def test_places_of_points(ros: Any, row_step: int, pad: int, *, big: bool) -> None:
+def test_positions_of_points_are_read(ros: Any, row_step: int, pad: int, *, big: bool) -> None:
     """x, y and z are those of the PCD, whatever the rows are like; every so many of them if asked for."""
     points = xyzi(6)
     rows = np.hstack((points.astype('>f4' if big else '<f4').view(np.uint8).reshape(2, -1), np.full((2, pad), 9, np.uint8)))
@@ -316,7 +316,7 @@ def test_places_of_points(ros: Any, row_step: int, pad: int, *, big: bool) -> No
 
 @pytest.mark.parametrize('changes', [{'width': 6}, {'fields': XYZI[:2]}, {'fields': [*XYZI[:2], ('z', 8, 8, 1)]},
                                      {'fields': [*XYZI[:2], ('z', 13, 7, 1)]}])  # fmt: skip
-def test_a_cloud_without_places(ros: Any, changes: dict[str, Any]) -> None:
+def test_a_cloud_without_xyz_has_no_positions(ros: Any, changes: dict[str, Any]) -> None:
     """A contradictory cloud, or one without x, y and z as float32, has none."""
     values = {'fields': XYZI, 'width': 5, 'point_step': 16} | changes
     message = ros.types.deserialize(CLOUD, cloud(ros, values.pop('fields'), xyzi().tobytes(), **values))

@@ -72,7 +72,7 @@ def record(types: MessageTypes, cdr: bytes, **settings_: Any) -> Any:
     return document(encode(Batch('own', '/own', 'own_msgs/msg/Own', (Sample(STAMP_NS, cdr),), len(cdr)), sensor, 'thor', types))
 
 
-def test_a_batch(ros: Any) -> None:
+def test_a_batch_has_each_sample_with_its_stamp(ros: Any) -> None:
     """A batch names its origin, its span and every sample with its own stamp and all fields in order."""
     cdrs = [ros.cdr(IMU, quaternion=np.array([index, 0, 0, 1], np.float32), temperature=index) for index in range(3)]
     encoding = ros.encode(IMU, *cdrs)
@@ -90,7 +90,7 @@ def test_a_batch(ros: Any) -> None:
     assert encoding.object.key == 'thor/imu/20251018/120000_imu.json'
 
 
-def test_a_large_batch(ros: Any) -> None:
+def test_a_large_batch_is_complete_and_in_order(ros: Any) -> None:
     """However many messages a batch has, all are in it once and in order, and what is not finite is counted over all."""
     values = {index: float(index) for index in range(251)} | {0: np.nan, 150: -np.inf, 250: np.nan}
     cdrs = [ros.cdr(JOINTS, name=[str(index)], position=np.array([value])) for index, value in values.items()]
@@ -100,7 +100,7 @@ def test_a_large_batch(ros: Any) -> None:
     assert (batch['count'], batch['non_finite']) == (251, 3)
 
 
-def test_odometry(ros: Any) -> None:
+def test_a_single_odometry_is_the_documented_record(ros: Any) -> None:
     """A single Odometry is the documented record: these names, no others."""
     pose = {'pose': {'position': {'x': 1.0, 'y': -2.5, 'z': 0.3}, 'orientation': {'w': 1.0}}}
     twist = {'twist': {'linear': {'x': 0.5}, 'angular': {'z': -0.1}}}
@@ -119,14 +119,14 @@ def test_odometry(ros: Any) -> None:
     assert encoding.object.key == 'thor/odom/20251018/120000_odom.json'
 
 
-def test_odometry_in_batches(ros: Any) -> None:
+def test_batched_odometry_has_all_fields(ros: Any) -> None:
     """Batched odometry has all the fields of the message, covariances too."""
     batch = document(ros.encode(ODOMETRY, ros.cdr(ODOMETRY), batch_s=1.0))
     assert list(batch['samples'][0]) == ['stamp_ns', 'header', 'child_frame_id', 'pose', 'twist']
     assert len(batch['samples'][0]['pose']['covariance']) == 36
 
 
-def test_a_record_of_another_type(ros: Any) -> None:
+def test_a_record_of_any_other_type_has_all_fields(ros: Any) -> None:
     """A single message of any other type is next to its origin, time and stamp; headers and times are objects."""
     header = {'stamp': {'sec': 7, 'nanosec': 8}, 'frame_id': 'front'}
     info = document(ros.encode('sensor_msgs/msg/CameraInfo', ros.cdr('sensor_msgs/msg/CameraInfo', header=header, width=640)))
@@ -138,7 +138,7 @@ def test_a_record_of_another_type(ros: Any) -> None:
     assert info['roi'] == {'x_offset': 0, 'y_offset': 0, 'height': 0, 'width': 0, 'do_rectify': False}
 
 
-def test_names_that_collide(ros: Any, tmp_path: Path) -> None:
+def test_colliding_field_names_are_kept_apart(ros: Any, tmp_path: Path) -> None:
     """The document's own names win; a field of the same name gets an underscore, and never displaces another field."""
     types = own_type(tmp_path, 'int8 type\nint8 stamp_ns\nint8 non_finite\nint8 topic\nint8 topic_\n')
     cdr = b'\0\1\0\0\1\2\3\4\5'
@@ -154,7 +154,7 @@ def test_python_words_as_names(tmp_path: Path) -> None:
     assert record(own_type(tmp_path, 'int8 from\nint8 class\n'), b'\0\1\0\0\1\2')['from'] == 1
 
 
-def test_constants_and_placeholders_are_no_fields(ros: Any, tmp_path: Path) -> None:
+def test_constants_and_placeholders_are_not_fields(ros: Any, tmp_path: Path) -> None:
     """Constants of the definition, and the byte of a message without fields, are not written."""
     types = own_type(tmp_path, 'int8 LEFT=1\nstring NAME="x"\nint8 value\n')
     assert set(record(types, b'\0\1\0\0\5')) == {'robot', 'sensor', 'topic', 'type', 'timestamp', 'stamp_ns', 'value'}
@@ -162,7 +162,7 @@ def test_constants_and_placeholders_are_no_fields(ros: Any, tmp_path: Path) -> N
     assert list(empty) == ['robot', 'sensor', 'topic', 'type', 'timestamp', 'stamp_ns']
 
 
-def test_every_kind_of_field(tmp_path: Path) -> None:
+def test_every_kind_of_field_has_its_form_in_json(tmp_path: Path) -> None:
     """Scalars, arrays, sequences, bytes and nested messages each have their form, in big-endian CDR as well."""
     types = own_type(tmp_path, EVERY_KIND)
     store = get_typestore(Stores.LATEST)
@@ -201,14 +201,14 @@ def test_every_kind_of_field(tmp_path: Path) -> None:
         }  # fmt: skip
 
 
-def test_joint_states_without_velocity(ros: Any) -> None:
+def test_empty_sequences_are_empty_lists(ros: Any) -> None:
     """Empty sequences at the end of a message are empty lists."""
     batch = document(ros.encode(JOINTS, ros.cdr(JOINTS, name=['a', 'b'], position=np.array([0.1, 0.2]))))
     sample = batch['samples'][0]
     assert (sample['name'], sample['position'], sample['velocity'], sample['effort']) == (['a', 'b'], [0.1, 0.2], [], [])
 
 
-def test_lowstate(ros: Any) -> None:
+def test_nested_messages_become_objects(ros: Any) -> None:
     """Nested messages and arrays of them become objects; float32 scalars are as short and exact as float32 arrays."""
     motor = ros.make('go2_interfaces/msg/MotorState', q=0.1, temperature=-4, reserve=np.array([1, 2], np.uint32))
     remote = np.arange(40, dtype=np.uint8)
@@ -223,7 +223,7 @@ def test_lowstate(ros: Any) -> None:
     assert b'"power_v":28.7,' in body
 
 
-def test_what_is_not_finite_has_a_form_in_json_and_is_counted(ros: Any) -> None:
+def test_non_finite_numbers_have_a_form_in_json_and_are_counted(ros: Any) -> None:
     """NaN is null, infinities are texts, in arrays and scalars, and the document says how many there were."""
     bad = np.array([np.nan, 1, np.inf, -np.inf], np.float32)
     batch = document(ros.encode(IMU, ros.cdr(IMU, quaternion=bad), ros.cdr(IMU)))
@@ -253,14 +253,14 @@ def test_values_and_marks_are_those_of_the_message(ros: Any, kind: str, values: 
     } == values
 
 
-def test_the_word_null_is_no_number(ros: Any) -> None:
+def test_the_text_null_is_not_a_number(ros: Any) -> None:
     """Text that contains ``null`` counts as nothing missing."""
     batch = document(ros.encode(JOINTS, ros.cdr(JOINTS, name=['null', 'a null', ',null,'])))
     assert batch['samples'][0]['name'] == ['null', 'a null', ',null,']
     assert 'non_finite' not in batch
 
 
-def test_the_one_float_that_short_decimals_lose(ros: Any) -> None:
+def test_the_float_that_short_decimals_lose_is_exact(ros: Any) -> None:
     """7.038531e-26 read by way of float64 is another float32: it and its negative are written longer."""
     awkward = float.fromhex('0x1.5c87fap-84')
     assert np.float32(float('7.038531e-26')) != np.float32(awkward), 'the reason for this test is gone'
@@ -276,7 +276,7 @@ def unlike(value: Any) -> str | None:
     return None if np.isnan(value) else 'Infinity' if value > 0 else '-Infinity'
 
 
-def test_infinities_of_a_scan_come_back(ros: Any) -> None:
+def test_infinities_of_a_scan_round_trip(ros: Any) -> None:
     """REP 117: nothing within range, too close, and an invalid reading are three things, to a strict parser and ``decode``."""
     scan, ranges = 'sensor_msgs/msg/LaserScan', [1.5, math.inf, -math.inf, math.nan, 0.1]
     cdrs = [ros.cdr(scan, ranges=np.array(ranges, np.float32), range_max=math.inf)] * 2
@@ -321,7 +321,7 @@ def test_numbers_and_text_read_back_bit_for_bit(ros: Any, words: list[int], long
 
 
 @pytest.mark.parametrize('batch_s', [0.0, 1.0])
-def test_several_messages_are_never_cut_down_to_one(ros: Any, batch_s: float) -> None:
+def test_a_batch_of_several_messages_keeps_them_all(ros: Any, batch_s: float) -> None:
     """Whatever the settings say, a batch of several messages is written as a batch."""
     encoding = ros.encode(ODOMETRY, ros.cdr(ODOMETRY), ros.cdr(ODOMETRY), batch_s=batch_s)
     assert document(encoding)['count'] == encoding.object.samples == 2

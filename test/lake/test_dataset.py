@@ -1,8 +1,23 @@
-"""A dataset has every message of its anchor once, with the messages of the other sensors at that time, as published."""
+"""A dataset has every message of its anchor once, with the messages of the other sensors at that time, as published.
+
+The examples that researchers copy from run as they stand.
+
+Several processes read a dataset without shared state: each sample once per epoch, however they were started.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import json
+import multiprocessing
+import os
 import pickle
+import subprocess
+import sys
+import threading
+import time
+import types
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +26,13 @@ import pyarrow as pa
 import pytest
 import simplejpeg
 from lake.making import NOON_NS, folder_store, merge
-from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, jpeg, seconds_of
+from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, in_a_child, jpeg, seconds_of
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, SettingError, UnknownName
+from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows.catalog import BUCKET
-from shadowhound_data_logger.lake import MissionDataset, Near, Window, query, selecting
+from shadowhound_data_logger.lake import MissionDataset, Near, Window, dataset, prefetch, query, selecting, shards
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import FetchRequest, fetch
 from shadowhound_data_logger.lake.fetched import keep_rows
@@ -26,6 +42,7 @@ from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if TYPE_CHECKING:
     from shadowhound_tower.embedded import Tower
+
 
 ALIGN = {'odom': 0.5, 'imu': Window(0.5, rows=8), 'joints': 0.2, 'lowstate': 5.0, 'lidar': 0.5}
 SECONDS = 6
@@ -93,7 +110,7 @@ def test_by_received_samples_are_what_had_arrived(tmp_path: Path) -> None:
     by_received.close()
 
 
-def test_a_causal_data_set_knows_nothing_later(tmp_path: Path) -> None:
+def test_a_causal_dataset_has_no_later_values(tmp_path: Path) -> None:
     """Odometry comes a little after each frame: the nearest is that, the causal one is that of the second before."""
     dataset = MissionDataset(drive(tmp_path), align={'odom': 1.5, 'joints': 0.2}, causal=True)
     for number in range(1, SECONDS):
@@ -122,7 +139,7 @@ def test_an_archive_is_as_many_samples_as_it_has_frames(tmp_path: Path, frames: 
     assert list(dataset.stamps_ns) == [NOON_NS + number * SECOND // FRAMES_HZ for number in range(len(dataset))]
 
 
-def test_repeats_are_samples_of_their_own(tmp_path: Path) -> None:
+def test_repeats_are_separate_samples(tmp_path: Path) -> None:
     """A frame that was stored once and seen thrice is three samples: as rows with different times, and in an archive."""
     settings = folder_store(tmp_path)
     still = Drive(settings, tmp_path)
@@ -157,7 +174,7 @@ def test_messages_too_far_in_time_are_missing(tmp_path: Path) -> None:
     assert sample['imu'].shape[0] == 3
 
 
-def test_robots_differ_in_what_they_have(tmp_path: Path) -> None:
+def test_robots_may_have_different_sensors(tmp_path: Path) -> None:
     """One that stored nothing of a sensor has samples of the same shape as the others, all of it missing."""
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(1)
@@ -169,7 +186,7 @@ def test_robots_differ_in_what_they_have(tmp_path: Path) -> None:
     assert not any(bare[f'{name}_ok'].any() for name in ('joints', 'imu', 'lidar'))
 
 
-def test_what_was_read_ahead_for_a_batch_does_not_stay(tmp_path: Path) -> None:
+def test_prefetched_objects_of_a_batch_are_released(tmp_path: Path) -> None:
     """One frame needs few of an archive's neighbors: the others would fill the memory, batch by batch."""
     dataset = MissionDataset(drive(tmp_path, frames='tar'), align={'imu': 1.0, 'odom': 1.0})
     for number in (0, 5, 9):
@@ -179,7 +196,7 @@ def test_what_was_read_ahead_for_a_batch_does_not_stay(tmp_path: Path) -> None:
     dataset.close()
 
 
-def test_a_pose_that_is_known_is_not_lost_at_the_side_of_one_that_is_not(tmp_path: Path) -> None:
+def test_a_known_pose_is_kept_next_to_an_unknown_one(tmp_path: Path) -> None:
     """Odometry ends within an archive: its own pose counts for the frames whose next archive has none."""
     settings = folder_store(tmp_path)
     still = Drive(settings, tmp_path)
@@ -213,7 +230,7 @@ def test_incomplete_samples_can_be_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('frames', ['jpeg', 'tar'])
-def test_all_ways_give_the_same(tmp_path: Path, frames: str) -> None:
+def test_every_way_to_read_gives_the_same_samples(tmp_path: Path, frames: str) -> None:
     """By number, several at once, streamed, and from a copy that went through pickle."""
     dataset = MissionDataset(drive(tmp_path, frames=frames), align=ALIGN)
     expected = [dataset[number] for number in range(len(dataset))]
@@ -240,7 +257,7 @@ def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
     assert len(query.objects(selecting.fetched(to)).to_pylist()) == len(query.objects(source).to_pylist())
 
 
-def test_a_folder_without_rows_is_no_data_set(tmp_path: Path) -> None:
+def test_a_folder_without_rows_is_not_a_dataset(tmp_path: Path) -> None:
     """It is not there, or its files were fetched by prefix: an empty data set would say that there are no frames."""
     (tmp_path / 'data' / 'thor' / 'camera').mkdir(parents=True)
     for folder in ('nowhere', 'data'):
@@ -256,7 +273,7 @@ def test_an_anchor_that_the_store_does_not_have_is_an_error(tmp_path: Path) -> N
     assert len(MissionDataset(source, since='2020-01-01', until='2020-01-02')) == 0
 
 
-def test_a_sensor_of_which_nothing_is_known_is_no_neighbour(tmp_path: Path) -> None:
+def test_an_unknown_sensor_cannot_be_aligned(tmp_path: Path) -> None:
     """Misspelt, or not fetched with the frames: an error, not a column of NaN."""
     source = drive(tmp_path, without=['imu'])
     for name in ('odometer', 'imu'):
@@ -276,7 +293,7 @@ def test_repeats_survive_a_merge(tmp_path: Path) -> None:
     assert list(MissionDataset(source).stamps_ns) == [NOON_NS, NOON_NS + SECOND]
 
 
-def test_an_image_of_another_size(tmp_path: Path) -> None:
+def test_an_image_is_averaged_when_it_is_resized(tmp_path: Path) -> None:
     """A picture of half the size is the average, not every other pixel."""
     source = drive(tmp_path, 1)
     small = MissionDataset(source, size=(12, 16))[0]['image']
@@ -286,7 +303,7 @@ def test_an_image_of_another_size(tmp_path: Path) -> None:
     assert MissionDataset(source, size=(10, 14))[0]['image'].shape == (10, 14, 3)
 
 
-def test_questions_are_those_of_the_catalogue(tmp_path: Path) -> None:
+def test_the_selection_is_that_of_the_catalog(tmp_path: Path) -> None:
     """The flags restrict the frames but not the aligned sensors; several robots are not mixed."""
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(4)
@@ -303,7 +320,7 @@ def test_questions_are_those_of_the_catalogue(tmp_path: Path) -> None:
     assert len(MissionDataset(source, mission='nobody')) == 0
 
 
-def test_content_that_is_not_what_was_stored(tmp_path: Path) -> None:
+def test_changed_content_is_an_error(tmp_path: Path) -> None:
     """Is an error that names the object, as is an object that is gone."""
     source = drive(tmp_path, 2)
     dataset = MissionDataset(source)
@@ -320,7 +337,7 @@ def test_content_that_is_not_what_was_stored(tmp_path: Path) -> None:
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('frames', ['jpeg', 'tar'])
-def test_from_a_real_server(tmp_path: Path, seaweed: Tower, frames: str) -> None:
+def test_an_s3_server_gives_the_same_samples(tmp_path: Path, seaweed: Tower, frames: str) -> None:
     """The same samples as from a folder of the same objects."""
     robot = f'thor{frames}'
     ours = Drive(seaweed.store_settings(), tmp_path / 's3', robot)
@@ -383,3 +400,248 @@ def test_rows_of_several_frames_are_one_track_in_order() -> None:
     assert track.end_ns.tolist() == track.latest_ns.tolist() == [6, 7, 8, 9]
     some = track.only(np.array([1, 3]))
     assert [some.object(number).key for number in range(2)] == ['2.jpg', '4.jpg']
+
+
+ROOT = Path(__file__).parents[2]
+TIMEOUT_S = 200
+
+
+def run(example: str, *arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    """In a separate folder if SHADOWHOUND_HOME names one: MLflow writes artifacts to the working directory."""
+    return subprocess.run([sys.executable, str(ROOT / 'examples' / example), *arguments], env={**os.environ, **environ},
+                          capture_output=True, text=True, check=False, timeout=TIMEOUT_S,
+                          cwd=environ.get('SHADOWHOUND_HOME'))  # fmt: skip
+
+
+@pytest.mark.skipif(importlib.util.find_spec('torch') is None, reason='torch is not installed (the extra "train")')
+def test_a_policy_is_trained_and_its_run_is_in_mlflow(tmp_path: Path) -> None:
+    """Parameters, a loss for each epoch and a checkpoint, in the guide's experiment."""
+    import mlflow
+
+    home, uri = tmp_path / 'home', f'sqlite:///{tmp_path / "mlflow.db"}'
+    home.mkdir()
+    settings = type(folder_store(tmp_path))(directory=home / 'store')
+    Drive(settings, tmp_path).record(24, without=['imu', 'joints', 'lidar', 'lowstate'])
+    environ = {'SHADOWHOUND_HOME': str(home), 'MLFLOW_TRACKING_URI': uri, 'AWS_ENDPOINT_URL': ''}
+    ran = run('train_navigation_policy.py', '--epochs', '2', **environ)
+    assert ran.returncode == 0, ran.stderr
+    client = mlflow.MlflowClient(uri)
+    experiment = client.get_experiment_by_name('navigation_policy_training')
+    run_ = client.search_runs([experiment.experiment_id])[0]
+    assert run_.info.status == 'FINISHED'
+    assert (run_.data.params['frames'], run_.data.params['validation_frames']) == ('18', '5')
+    assert len(client.get_metric_history(run_.info.run_id, 'train_loss')) == 2
+    assert {'val_loss', 'frames_per_s', 'val_loss_of_the_mean'} < run_.data.metrics.keys()
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.long('processes that import much')
+def test_several_processes_evaluate_all_frames(tmp_path: Path, seaweed: Tower) -> None:
+    """Every frame of the robot once, and no secret in what the processes say."""
+    pytest.importorskip('daft')
+    drive = Drive(seaweed.store_settings(), tmp_path, 'fleetrobot')
+    drive.record(5, without=['imu', 'joints', 'lidar', 'lowstate', 'odom'])
+    environ = seaweed.environment()
+    ran = run(
+        'fleet_frames.py', '--robot', 'fleetrobot', '--workers', '2', '--json', **environ, RUST_LOG='debug', DAFT_PROGRESS_BAR='0'
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert sorted(json.loads(ran.stdout)['keys']) == sorted(row['key'] for row in drive.rows)
+    assert environ['AWS_SECRET_ACCESS_KEY'] not in ran.stdout + ran.stderr
+
+
+@pytest.mark.long('a second of CPU or more')
+@pytest.mark.parametrize('example', ['train_navigation_policy.py', 'fleet_frames.py'])
+def test_each_example_has_a_usage_line(example: str) -> None:
+    """``--help`` names what it needs."""
+    if example.startswith('train') and importlib.util.find_spec('torch') is None:
+        pytest.skip('torch is not installed (the extra "train")')
+    ran = run(example, '--help')
+    assert ran.returncode == 0
+    assert '--since' in ran.stdout
+
+
+WORKER_SECONDS = 10
+CHILD_S = 60
+
+
+@pytest.fixture(scope='module')
+def source(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
+    """Ten archives of four frames each."""
+    tmp = tmp_path_factory.mktemp('drive')
+    Drive(folder_store(tmp), tmp).record(WORKER_SECONDS, frames='tar', without=['imu', 'joints', 'lidar', 'lowstate'])
+    return Bucket(folder_store(tmp), BUCKET)
+
+
+@pytest.fixture
+def in_worker(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The worker information that torch provides, and that torch is loaded."""
+    told = types.SimpleNamespace(id=0, num_workers=1)
+    module: Any = types.ModuleType('torch.utils.data')
+    module.get_worker_info = lambda: told
+    module.IterableDataset = type('IterableDataset', (), {'register': classmethod(lambda _, kind: kinds.append(kind))})
+    kinds: list[type] = module.__dict__.setdefault('kinds', [])
+    monkeypatch.setitem(sys.modules, 'torch.utils.data', module)
+
+    def be(number: int, count: int) -> Any:
+        told.id, told.num_workers = number, count
+        return module
+
+    return be
+
+
+def stamps(stream: Any) -> list[int]:
+    return [int(sample['stamp_ns']) for sample in stream]
+
+
+def test_workers_cover_all_shards_completely(source: Bucket, in_worker: Any) -> None:
+    """Three workers: no archive is read by two, every frame comes once; a DataLoader takes the stream for an IterableDataset."""
+    frames = MissionDataset(source)
+    got = []
+    for number in range(3):
+        module = in_worker(number, 3)
+        got.append(stamps(frames.stream(shuffle=True)))
+    assert dataset.MissionStream in module.kinds
+    archives = [{stamp // 10**9 for stamp in mine} for mine in got]
+    assert sum(map(len, archives)) == WORKER_SECONDS
+    assert len(set().union(*archives)) == WORKER_SECONDS
+    in_worker(0, 1)
+    assert sorted(stamp for mine in got for stamp in mine) == stamps(frames.stream())
+
+
+def test_ranks_split_what_their_workers_split(source: Bucket, in_worker: Any) -> None:
+    """Two processes of two workers each: four shares of one whole."""
+    frames, got = MissionDataset(source), []
+    for rank in range(2):
+        for number in range(2):
+            in_worker(number, 2)
+            got += stamps(frames.stream(shuffle=True, rank=rank, ranks=2))
+    in_worker(0, 1)
+    assert sorted(got) == stamps(frames.stream())
+
+
+def test_epochs_differ_and_can_be_repeated(source: Bucket) -> None:
+    """Each iteration is another epoch's order, ``set_epoch`` names one, and seeds differ."""
+    frames = MissionDataset(source)
+    stream = frames.stream(shuffle=True, seed=7)
+    first, second = stamps(stream), stamps(stream)
+    assert first != second
+    assert sorted(first) == sorted(second) == stamps(frames.stream())
+    stream.set_epoch(1)
+    assert stamps(stream) == second
+    assert stamps(frames.stream(shuffle=True, seed=8)) != first
+    assert stamps(pickle.loads(pickle.dumps(frames.stream(shuffle=True, seed=7)))) == first  # noqa: S301 - our own
+
+
+def test_a_shuffled_stream_mixes_archives_and_reads_each_once(source: Bucket) -> None:
+    """Neighbors in the stream come from several archives, and no object is fetched twice."""
+    frames = MissionDataset(source)
+    asked: list[str] = []
+    read = frames._place.read
+
+    class Place:
+        def read(self, bucket: str, key: str, most: int) -> bytes:
+            asked.append(key)
+            return read(bucket, key, most)
+
+    frames._place = Place()  # type: ignore[assignment]
+    mixed = [stamp // 10**9 for stamp in stamps(frames.stream(shuffle=True))]
+    assert len(set(mixed[: 2 * FRAMES_HZ])) > 2
+    assert sorted(asked) == sorted(set(asked))
+    assert len(asked) == WORKER_SECONDS
+
+
+def test_a_shard_of_single_objects_is_bounded() -> None:
+    """A track of single frames is cut every 64 objects, an archive is one shard."""
+    counts = np.array([1] * 70 + [30, 30] + [1] * 2)
+    track = types.SimpleNamespace(count=counts)
+    cut = shards.shards([track], [np.arange(len(counts))])  # type: ignore[list-item]
+    assert [(each.first, each.last) for each in cut] == [(0, 64), (64, 70), (70, 71), (71, 72), (72, 74)]
+
+
+def test_prefetching_is_bounded(source: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the first sample, no more than the limit and one object is requested."""
+    frames = MissionDataset(source)
+    size = int(frames._selection.anchors[0].size[0])
+    monkeypatch.setattr(dataset, 'PREFETCH_BYTES', 3 * size)
+    asked: list[str] = []
+    read = frames._place.read
+    frames._place = types.SimpleNamespace(read=lambda bucket, key, most: (asked.append(key), read(bucket, key, most))[1])  # type: ignore[assignment]
+    streamed = iter(frames.stream())
+    next(streamed)
+    streamed.close()  # type: ignore[attr-defined]
+    assert len(asked) <= 5
+
+
+@pytest.mark.long('a second of CPU or more')
+@pytest.mark.seaweedfs
+@pytest.mark.parametrize('way', ['fork', 'spawn'])
+def test_a_process_started_after_reading_reads_on_its_own(tmp_path: Path, seaweed: Tower, way: str) -> None:
+    """Forked or spawned, it reads from the server what its parent reads, though the parent has connections and threads."""
+    robot = f'worker{way}'
+    Drive(seaweed.store_settings(), tmp_path, robot).record(4)
+    frames = MissionDataset(Bucket(seaweed.store_settings(), BUCKET), robot=robot)
+    expected = [int(sample['stamp_ns']) for sample in frames.__getitems__(range(4))]
+    context: Any = multiprocessing.get_context(way)
+    out = context.SimpleQueue()
+    child = context.Process(target=in_a_child, args=(frames, range(4), out))
+    child.start()
+    try:
+        child.join(CHILD_S)
+        assert child.exitcode == 0
+        assert out.get() == expected
+    finally:
+        child.kill()
+        child.join()
+        frames.close()
+
+
+def test_a_pickled_dataset_is_a_value(source: Bucket) -> None:
+    """No thread, lock or connection goes along, and neither does what was read."""
+    frames = MissionDataset(source)
+    before = len(pickle.dumps(frames))
+    frames.__getitems__(range(len(frames)))
+    assert len(pickle.dumps(frames)) == before
+    frames.close()
+
+
+@pytest.mark.long('a process of its own')
+def test_importing_it_loads_no_torch() -> None:
+    """Nor is it needed to make a data set of nothing."""
+    load = 'import sys; from shadowhound_data_logger.lake import MissionDataset'
+    program = f'{load}; print("torch" in sys.modules, MissionDataset.__name__)'
+    ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)
+    assert ran.stdout.split() == ['False', 'MissionDataset']
+
+
+@pytest.mark.parametrize('style', ['number', 'stream'])
+def test_torchs_data_loader_gives_every_frame_once(source: Bucket, style: str) -> None:
+    """Two forked workers give every frame once, as tensors."""
+    data = pytest.importorskip('torch.utils.data', reason='torch is not installed (the extra "train")')
+    frames = MissionDataset(source, align={'odom': 0.5})
+    given = frames if style == 'number' else frames.stream(shuffle=True)
+    loader = data.DataLoader(given, batch_size=3, num_workers=2, shuffle=True if style == 'number' else None)
+    batches = list(loader)
+    assert sorted(int(stamp) for batch in batches for stamp in batch['stamp_ns']) == sorted(stamps(frames.stream()))
+    assert tuple(batches[0]['image'].shape[1:]) == (24, 32, 3)
+    assert tuple(batches[0]['odom'].shape[1:]) == (13,)
+
+
+def test_the_threads_of_a_process_open_one_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads that start at the same time share one store: a client of S3 takes half a second and megabytes."""
+    opened: list[object] = []
+    begin = threading.Barrier(8)
+
+    def open_slowly(*_: object) -> object:
+        opened.append(object())
+        time.sleep(0.05)  # a client takes longer
+        return opened[-1]
+
+    def ask(_: int) -> object:
+        begin.wait()
+        return prefetch._of_this_process(StoreSettings(directory=tmp_path))
+
+    monkeypatch.setattr(prefetch, 'open_store', open_slowly)
+    with ThreadPoolExecutor(8) as pool:
+        found = set(pool.map(ask, range(8)))
+    assert [*found] == opened

@@ -1,21 +1,36 @@
-"""The requested objects are in the folder, complete and verified; existing ones are not downloaded again."""
+"""The requested objects are in the folder, complete and verified; existing ones are not downloaded again.
+
+A fetch that is killed again and again: what was whole stays and is not asked for again, and nothing else is left behind.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import signal
 import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from lake.making import NOON_NS, add, folder_store, row
+from faults.front import Front
+from faults.kinds import Fault
+from faults.upstream import Request
+from lake.making import NOON_NS, add, add_part, folder_store, row
 
 from shadowhound_data_logger.core import retry
+from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, StoreUnavailable
 from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import catalog
 from shadowhound_data_logger.formats.rows.catalog import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import FetchRequest, FetchResult, fetch, under
@@ -27,6 +42,7 @@ from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 
 if TYPE_CHECKING:
     from shadowhound_tower.embedded import Tower
+
 
 COUNT = 30
 PREFIX = 'thor/camera/20261028/'
@@ -100,7 +116,7 @@ def test_a_prefix_need_not_end_at_a_folder(settings: StoreSettings, prefix: str)
     assert [request.key for request in under(Bucket(settings, BUCKET), prefix)] == expected
 
 
-def test_what_was_changed_on_this_side_is_fetched_again(settings: StoreSettings, tmp_path: Path) -> None:
+def test_locally_changed_files_are_fetched_again(settings: StoreSettings, tmp_path: Path) -> None:
     """A file that is gone, of another size, or written since; only those."""
     source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
@@ -128,7 +144,7 @@ def test_verify_finds_what_has_the_right_size_and_time(settings: StoreSettings, 
     assert whole(to)
 
 
-def test_what_another_program_fetched_is_read_and_not_moved(settings: StoreSettings, tmp_path: Path) -> None:
+def test_files_of_another_program_are_verified_and_not_fetched(settings: StoreSettings, tmp_path: Path) -> None:
     """A folder that `aws s3 sync` or a lost memory left: the content is compared, nothing is transferred."""
     source, to = Asked(settings), tmp_path / 'data'
     for key, body in OBJECTS.items():
@@ -140,7 +156,7 @@ def test_what_another_program_fetched_is_read_and_not_moved(settings: StoreSetti
     assert source.asked == []
 
 
-def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings, tmp_path: Path) -> None:
+def test_content_damaged_in_transit_is_fetched_again(settings: StoreSettings, tmp_path: Path) -> None:
     """Damage that occurs once is repaired; permanent damage is a failure that names both checksums, and leaves no file."""
     once, always, *_ = OBJECTS
     damaged = {once: 1, always: 99}
@@ -162,14 +178,14 @@ def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings
     assert list((to / '.fetch' / 'parts').iterdir()) == []
 
 
-def test_the_word_of_the_catalogue_counts(settings: StoreSettings, tmp_path: Path) -> None:
+def test_the_checksum_of_the_catalog_counts(settings: StoreSettings, tmp_path: Path) -> None:
     """An object that is not what its row says is a failure, whatever it says of itself."""
     key = next(iter(OBJECTS))
     found = run(Asked(settings), tmp_path / 'data', requests=[FetchRequest(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
 
 
-def test_an_object_without_a_checksum_has_its_size_alone(settings: StoreSettings, tmp_path: Path) -> None:
+def test_an_object_without_a_checksum_is_compared_by_size(settings: StoreSettings, tmp_path: Path) -> None:
     """It is reported, and checked again the next time."""
     key = next(iter(OBJECTS))
     (settings.directory / '.metadata' / BUCKET / f'{key}.json').unlink()
@@ -198,7 +214,7 @@ def test_no_row_leads_out_of_the_folder(tmp_path: Path, robot: str) -> None:
     assert [path.parents[2] for path in kept] == [to / 'thor']
 
 
-def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_path: Path) -> None:
+def test_an_object_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_path: Path) -> None:
     """A deleted object, a folder in place of the file, the same key in two buckets: each is reported with its reason."""
     keys = list(OBJECTS)
     to = tmp_path / 'data'
@@ -232,13 +248,13 @@ def test_an_unreachable_store_ends_it(settings: StoreSettings, tmp_path: Path, m
         run(source, tmp_path / 'data', requests=requests, threads=2)
 
 
-def test_two_do_not_write_to_one_folder(settings: StoreSettings, tmp_path: Path) -> None:
+def test_only_one_process_writes_to_a_folder(settings: StoreSettings, tmp_path: Path) -> None:
     """The second says so."""
     with Fetched(tmp_path / 'data'), pytest.raises(LakeError, match='another fetch'):
         run(Asked(settings), tmp_path / 'data')
 
 
-def test_what_was_not_synced_is_read_again_after_a_power_cut(settings: StoreSettings, tmp_path: Path) -> None:
+def test_unsynced_files_are_verified_after_a_power_cut(settings: StoreSettings, tmp_path: Path) -> None:
     """Noted by a run that was killed, in another boot: the file is hashed, and moved if it is not whole."""
     source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
@@ -275,7 +291,7 @@ def real(seaweed: Tower, tmp_path_factory: pytest.TempPathFactory) -> Tower:
 
 
 @pytest.mark.seaweedfs
-def test_from_a_real_server(real: Tower, tmp_path: Path) -> None:
+def test_objects_are_fetched_from_an_s3_server(real: Tower, tmp_path: Path) -> None:
     """The same over S3, with an empty object and one of several pieces; the second run asks for no object."""
     with closing(open_store(real.store_settings(), UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/rosbags/large/0.mcap', os.urandom(5 << 20))
@@ -291,3 +307,115 @@ def test_from_a_real_server(real: Tower, tmp_path: Path) -> None:
     assert source.asked == []
     with pytest.raises(StoreUnavailable):
         run(Real(replace(real.store_settings(), endpoint_url='http://127.0.0.1:9')), to)
+
+
+KILLED_COUNT = 300
+SIZE = 2000
+ROBOT = 'killed'
+KEYS = [f'{ROBOT}/camera/{utc(NOON_NS):%Y%m%d}/{number:06d}_front.jpg' for number in range(KILLED_COUNT)]
+
+
+def body(number: int) -> bytes:
+    return hashlib.sha256(str(number).encode()).digest() * (SIZE // 32)
+
+
+KEPT = re.compile(rf'\.fetch/(lock|files\.db)|{ROBOT}/_catalog/date=[\d-]+/{ROBOT}_\d+_backfilled_[0-9a-f]+\.jsonl\.zst')
+SUMS = {key: hashlib.sha256(body(number)).hexdigest() for number, key in enumerate(KEYS)}
+
+
+class Counting(Front):
+    """Passes on this many objects and then stops answering; it records the requested ones."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url, lambda: Fault.HUNG if len(self.got) >= self.limit else Fault.NONE)
+        self.limit = 0
+        self.got: list[str] = []
+
+    def forward(self, request: Request, *, slowly: bool = False) -> bytes:
+        key = request.target.partition('?')[0].removeprefix(f'/{catalog.BUCKET}/')
+        if request.method == 'GET' and key in SUMS:
+            self.got.append(key)
+        return super().forward(request, slowly=slowly)
+
+
+@pytest.fixture(scope='module')
+def filled(seaweed: Tower, tmp_path_factory: pytest.TempPathFactory) -> Tower:
+    """All objects, and one part with their rows."""
+    folder = tmp_path_factory.mktemp('bodies')
+    rows = []
+    with closing(open_store(seaweed.store_settings(), UploadSettings())) as store:
+        for number, key in enumerate(KEYS):
+            stamp = str(NOON_NS + number * SECOND // 1000)
+            told = {'robot': ROBOT, 'sensor': 'camera', 't_start_ns': stamp, 't_end_ns': stamp}
+            add(store, folder, key, body(number), told)
+            said = {**told, 'sha256': SUMS[key]}
+            rows.append(catalog.row_of(catalog.BUCKET, key, len(body(number)), 'image/jpeg', said))
+        add_part(store, rows, 'part', folder)
+    return seaweed
+
+
+@pytest.fixture
+def front(filled: Tower) -> Iterator[Counting]:
+    with Counting(filled.endpoint_url) as front:
+        yield front
+
+
+def complete_files(to: Path) -> set[str]:
+    """The keys whose files have the right content; every file with a key's name has."""
+    found = {str(path.relative_to(to)): path for path in (to / ROBOT / 'camera').rglob('*.jpg')}
+    assert all(hashlib.sha256(path.read_bytes()).hexdigest() == SUMS[key] for key, path in found.items())
+    return set(found)
+
+
+def left_over(to: Path) -> list[str]:
+    """Files that are neither objects nor their rows nor what a next fetch has to know."""
+    found = {str(path.relative_to(to)) for path in to.rglob('*') if path.is_file()} - set(KEYS)
+    return sorted(name for name in found if not KEPT.fullmatch(name))
+
+
+@pytest.mark.seaweedfs
+def test_half_written_rows_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed at that moment they are not there, and what there was of them goes with the next fetch."""
+    said = catalog.row_of('sensor-data', f'{ROBOT}/camera/x.jpg', 1, 'image/jpeg', {'t_start_ns': str(NOON_NS)})
+
+    def die(_: object, __: object) -> None:
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'replace', die)
+        with pytest.raises(SystemExit):
+            keep_rows(tmp_path, [said])
+    assert left_over(tmp_path)
+    with Fetched(tmp_path):
+        pass
+    assert left_over(tmp_path) == []
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.long('kills')
+@pytest.mark.parametrize(('kills', 'asked'), [(3, [f'{ROBOT}/camera/']), (1, ['--robot', ROBOT])], ids=['prefix', 'question'])
+def test_a_killed_fetch_downloads_each_object_once(
+    filled: Tower, front: Counting, tmp_path: Path, kills: int, asked: list[str]
+) -> None:
+    """Every file that appears is whole, at any moment; after each kill the next run asks only for what is not there."""
+    to = tmp_path / 'data'
+    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'fetch', *asked, '--to', str(to)]
+    environ = {**os.environ, **filled.environment(), 'AWS_ENDPOINT_URL': front.url}
+    there: set[str] = set()
+    for number in range(kills):
+        begun, front.limit = len(front.got), KILLED_COUNT * (number + 1) // (kills + 1)
+        with subprocess.Popen(command, env=environ, stdout=subprocess.DEVNULL) as process:
+            end = time.monotonic() + 120
+            while len(front.got) < front.limit or not front.is_quiet or len(complete_files(to)) == len(there):
+                assert time.monotonic() < end, 'it fetches nothing'
+                assert process.poll() is None
+                time.sleep(0.02)
+            process.send_signal(signal.SIGKILL)
+        assert not there & set(front.got[begun:])
+        there = complete_files(to)
+    begun, front.limit = len(front.got), sys.maxsize
+    last = subprocess.run(command, env=environ, check=True, capture_output=True, text=True, timeout=120)
+    assert f'{len(there)} were there already' in last.stdout.replace(',', '')
+    assert set(front.got[begun:]) == set(KEYS) - there, 'twice is what the killed one asked for in its last instant'
+    assert complete_files(to) == set(KEYS)
+    assert left_over(to) == []

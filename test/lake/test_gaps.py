@@ -47,7 +47,7 @@ def test_without_a_watermark_gaps_are_unknown(store: StoreSettings) -> None:
     assert (found.is_whole, found.stretches[0].is_open, found.complete_ns) == (False, True, NOON_NS)
 
 
-def test_by_received_a_gap_is_when_its_messages_would_have_arrived(store: StoreSettings, tmp_path: Path) -> None:
+def test_by_received_a_gap_has_arrival_times(store: StoreSettings, tmp_path: Path) -> None:
     """What has no time of arrival is untimed on that clock, and no watermark reaches into it."""
     late = {'received_from_ns': NOON_NS + 120 * SECOND, 'received_to_ns': NOON_NS + 123 * SECOND}
     whole = {'received_from_ns': NOON_NS + 100 * SECOND, 'received_to_ns': NOON_NS + 160 * SECOND}
@@ -90,14 +90,14 @@ def test_a_reported_gap_above_the_watermark_is_known(store: StoreSettings, tmp_p
     assert [gap.count for gap in found.untimed] == [7]
 
 
-def test_what_is_only_received_is_not_known(store: StoreSettings, tmp_path: Path) -> None:
+def test_with_received_only_accounts_gaps_are_unknown(store: StoreSettings, tmp_path: Path) -> None:
     """Without sequence numbers or a regular rate, a watermark accounts for received messages, but not for lost ones."""
     tell(store, tmp_path, mark(60, grade='received-only'), mark(60, grade='estimated', topic='/odom'))
     assert seconds(ask(store, 0, 60)) == [(0, 60, (), '')]
     assert seconds(ask(store, 0, 60, '/odom')) == [(0, 60, (), 'estimated')]
 
 
-def test_messages_of_another_type_are_nothing_of_the_topic(store: StoreSettings, tmp_path: Path) -> None:
+def test_messages_of_another_type_do_not_count(store: StoreSettings, tmp_path: Path) -> None:
     """They are listed, and the time is whole."""
     tell(store, tmp_path, mark(60), lost('1', 0, 60, kind='rejected', cause='wrong_type'))
     found = ask(store, 0, 60)
@@ -139,7 +139,7 @@ def test_a_gap_that_moves_to_another_day_is_reported_once(store: StoreSettings, 
     assert ask(store, day_s, day_s + 200).is_whole
 
 
-def test_a_part_of_a_time_needs_no_second_look(store: StoreSettings, tmp_path: Path) -> None:
+def test_a_part_read_for_one_time_is_not_read_again(store: StoreSettings, tmp_path: Path) -> None:
     """``between`` answers as ``known`` would; what is outside is an error."""
     tell(store, tmp_path, mark(60), *(lost(str(at), at, at + 0.5) for at in range(0, 60, 3)))
     found = ask(store, 0, 90)
@@ -150,14 +150,14 @@ def test_a_part_of_a_time_needs_no_second_look(store: StoreSettings, tmp_path: P
         found.between(NOON_NS, NOON_NS + 91 * SECOND)
 
 
-def test_of_what_was_stated_often_the_newest_counts(store: StoreSettings, tmp_path: Path) -> None:
+def test_the_newest_statement_of_a_gap_counts(store: StoreSettings, tmp_path: Path) -> None:
     """In whatever file it is."""
     for part in range(30):
         tell(store, tmp_path, *(lost(str(gap), gap, gap + 1, part + 1, count=part + 1) for gap in range(5)), name=f'{part:02}')
     assert gaps.newest(Bucket(store, BUCKET))['count'].to_pylist() == [30] * 5
 
 
-def test_an_invalid_time_range(store: StoreSettings) -> None:
+def test_an_invalid_time_range_is_refused(store: StoreSettings) -> None:
     """It says what is wrong, and what is allowed."""
     with pytest.raises(SettingError, match='sink'):
         known('thor', '/imu', 0, 1, sink='tape', source=Bucket(store, BUCKET))
@@ -234,7 +234,7 @@ def test_sql_sees_gaps_and_watermarks(store: StoreSettings, tmp_path: Path) -> N
         lake.sql('SELECT * FROM gaps', source, where='x > 1')
 
 
-def test_the_catalogue_does_not_see_the_journal(store: StoreSettings, tmp_path: Path) -> None:
+def test_the_catalog_does_not_include_the_gap_journal(store: StoreSettings, tmp_path: Path) -> None:
     """Its files are not part of the catalog, and not objects without a row."""
     tell(store, tmp_path, mark(60))
     source = Bucket(store, BUCKET)
@@ -262,7 +262,7 @@ def test_coverage_by_the_hour(store: StoreSettings, tmp_path: Path) -> None:
     assert dict(part.hours) == {NOON_NS: {'downsampled': 60.0}}
 
 
-def test_a_part_with_a_cause_for_each_row_is_answered_with_few() -> None:
+def test_many_causes_are_summarized() -> None:
     """What a part says is hostile: a list of all causes at each time would take hours, and all memory."""
     rows = [lost(f'{number}', number, 5000 - number, cause=f'cause-{number}') for number in range(1000)]
     found = of_rows('thor', 'objects', '/imu', NOON_NS, NOON_NS + 5000 * SECOND, rows)

@@ -183,7 +183,7 @@ def test_row_files_are_read_in_addition_to_the_tables(tmp_path: Path, tables: Ta
     assert len(fresh(source, files, tables.open(OBJECT_ROWS), catalog.OBJECTS, Findings())) == 0
 
 
-def test_a_file_that_is_not_one_is_named_and_counted(tmp_path: Path, tables: Tables) -> None:
+def test_an_invalid_row_file_is_named_and_counted(tmp_path: Path, tables: Tables) -> None:
     """It is read once; the rows of others count."""
     source, findings = bucket(tmp_path), Findings(lambda _: None)
     rows = [row('camera', NOON_NS)]

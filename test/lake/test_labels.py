@@ -98,7 +98,7 @@ def test_samples_have_labels(lake: Bucket) -> None:
     assert not any(pickle.loads(pickle.dumps(dataset)).labels())  # noqa: S301 - our own
 
 
-def test_files_of_labels() -> None:
+def test_labels_are_read_from_csv_and_coco() -> None:
     """A CSV and a COCO file; what is neither says why."""
     head, first = b'label,since,until,key,x,y,width,height,note', b'stairs,2026-10-28T12:00,2026-10-28T12:01,,,,,,up'
     body = b'\n'.join((head, first, b'mug,,,thor/a.jpg,1,2,3,4,'))
@@ -131,7 +131,7 @@ def test_files_of_labels() -> None:
     {'key': 'thor/../a', 'bucket': 'sensor-data'}, {'robot': '../x'},
     {'key': 'thor/a.jpg', 'bucket': 'sensor-data', 'x': 0.0, 'y': 0.0, 'width': float('nan'), 'height': 1.0},
 ])  # fmt: skip
-def test_what_is_no_label_is_refused(wrong: dict[str, object]) -> None:
+def test_an_invalid_label_is_refused(wrong: dict[str, object]) -> None:
     """Before anything is written."""
     with pytest.raises((SettingError, NameRefused)):
         Label(**{'robot': 'thor', 'label': 'stairs', 'since_ns': 1, 'until_ns': 2, **wrong}).checked()  # type: ignore[arg-type]

@@ -95,7 +95,7 @@ def test_the_most_similar_come_first(lake: Lake, pair: Path) -> None:
     assert (answer.pictures, answer.without, len(answer.rows)) == (4, 0, 1)
 
 
-def test_what_has_a_vector_is_not_looked_at_again(lake: Lake, pair: Path) -> None:
+def test_images_with_a_vector_are_not_embedded_again(lake: Lake, pair: Path) -> None:
     model = OnnxPair.open(pair)
     embed(lake.store, lake.source, model)
     before = lake.parts()
@@ -172,7 +172,7 @@ def spoil(path: Path, fault: str) -> None:
     path.write_bytes({'truncated': body[:-9], 'noise': b'PAR1' + bytes(200) + b'PAR1'}.get(fault, out.getvalue()))
 
 
-def test_folders_that_are_no_model_are_refused(tmp_path: Path, pair: Path) -> None:
+def test_folders_without_a_model_are_refused(tmp_path: Path, pair: Path) -> None:
     with pytest.raises(LakeError, match='has no image model'):
         OnnxPair.open(tmp_path)
     noise = tmp_path / 'noise'
@@ -202,7 +202,7 @@ def refer_outside(path: Path) -> None:
     path.write_bytes(model.SerializeToString())
 
 
-def test_a_model_that_a_package_ships(tmp_path: Path) -> None:
+def test_a_model_without_a_description_is_used(tmp_path: Path) -> None:
     """SqueezeNet as the package onnx has it, without a document about pictures: its input says how large they are."""
     shipped = Path(onnx.__file__).parent / 'backend' / 'test' / 'data' / 'light' / 'light_squeezenet.onnx'
     folder = tmp_path / 'squeezenet'
@@ -220,7 +220,7 @@ def test_a_model_that_a_package_ships(tmp_path: Path) -> None:
     assert np.linalg.norm(found, axis=1) == pytest.approx([1, 1])
 
 
-def test_a_long_picture_is_refused_before_it_is_large(pair: Path) -> None:
+def test_an_oversized_image_is_refused_before_it_is_decoded(pair: Path) -> None:
     with pytest.raises(ValueError, match='too elongated'):
         OnnxPair.open(pair).embed_images([Image.new('RGB', (SIDE * 8192, 1))])
 
@@ -232,7 +232,7 @@ rows_of_six = stn.arrays(np.float16, st.tuples(st.integers(0, 40), st.just(6)), 
 
 
 @given(rows_of_six, stn.arrays(np.float32, 6, elements=st.floats(-1, 1, width=32)), st.integers(1, 50))
-def test_it_is_numpy_s_answer(vectors: Any, wanted: Any, limit: int) -> None:
+def test_the_answer_agrees_with_numpy(vectors: Any, wanted: Any, limit: int) -> None:
     found, scores = nearest(vectors, wanted, limit)
     whole = vectors.astype(np.float32) @ wanted
     expected = np.argsort(-whole, kind='stable')[:limit]
@@ -240,7 +240,7 @@ def test_it_is_numpy_s_answer(vectors: Any, wanted: Any, limit: int) -> None:
     assert scores.tolist() == whole[expected].tolist()
 
 
-def test_pictures_of_one_content_are_all_answers(lake: Lake, pair: Path) -> None:
+def test_images_with_the_same_content_are_all_found(lake: Lake, pair: Path) -> None:
     lake.add('red again', picture(COLOURS['red']), NOON_NS + 300 * SECOND)
     model = OnnxPair.open(pair)
     found = embed(lake.store, lake.source, model)
@@ -248,7 +248,7 @@ def test_pictures_of_one_content_are_all_answers(lake: Lake, pair: Path) -> None
     assert set(lake.most_similar(model, model.embed_text('red'))[:2]) == {'red', 'red again'}
 
 
-def test_a_death_in_the_middle_costs_no_vector(lake: Lake, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_run_loses_no_vector(lake: Lake, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What was put by then is there, and the next run makes the rest."""
     monkeypatch.setattr(likeness, 'PART_ROWS', 1)
     model, put = OnnxPair.open(pair), likeness.put_part

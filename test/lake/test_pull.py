@@ -1,10 +1,15 @@
-"""A researcher asks a robot for what it keeps, and gets it: a spool, a folder as the store, and the command line between them."""
+"""A researcher asks a robot for what it keeps, and gets it: a spool, a folder as the store, and the command line between them.
+
+What a robot answers to a request, and labels below a robot's own prefix: anything may be in them.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import random
 import time
+import unicodedata
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
@@ -13,7 +18,11 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from lake.making import add, folder_store, merge
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lake import bad_parts
+from lake.making import NOON_NS as LAKE_NOON_NS
+from lake.making import add, fill, folder_store, merge
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
 
 from shadowhound_data_logger.bags.kept import KeptCut
@@ -24,10 +33,12 @@ from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
-from shadowhound_data_logger.core.mailbox import KeptFilter, ObjectCount, PullRequest
+from shadowhound_data_logger.core.keys import UNSEEN
+from shadowhound_data_logger.core.mailbox import KeptFilter, ObjectCount, PullRequest, encode_inbox
 from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.formats.rows import catalog, parts
+from shadowhound_data_logger.formats.rows.labels import LABELS
 from shadowhound_data_logger.lake import labels, link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -114,7 +125,7 @@ def run(*arguments: str, code: int = 0) -> Any:
     return json.loads(done.stdout)
 
 
-def test_a_pull_from_asking_to_arrival(field: Field) -> None:
+def test_a_pull_delivers_the_requested_objects(field: Field) -> None:
     """The rows arrive before the bytes; requested objects arrive verified, and are then no longer on the robot."""
     field.records(*range(6))
     assert field.kept() == [0, 1, 2, 3, 4, 5]
@@ -176,7 +187,7 @@ def test_objects_lost_on_the_robot_are_reported(field: Field) -> None:
     assert field.kept() == [5, 6, 7, 8, 9]
 
 
-def test_a_request_is_taken_back(field: Field) -> None:
+def test_a_request_is_cancelled(field: Field) -> None:
     """The robot answers that it was, and what it has not sent stays."""
     field.records(1)
     request = run('pull', '--sensor', 'camera')['id']
@@ -274,7 +285,7 @@ def test_throughput_predicts_the_duration_of_a_pull(field: Field, tmp_path: Path
     assert target.read_bytes().startswith(b'\x89PNG')
 
 
-def test_a_data_set_asks_for_what_is_kept(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dataset_pulls_kept_data(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It waits until the objects and their rows have arrived; others are kept. A folder has no robot to request from."""
     field.records(*range(6))
     monkeypatch.setattr(lake.time, 'sleep', lambda _: field.passes())
@@ -337,3 +348,98 @@ def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:
     assert newest
     assert newest.state == 'done\x07'
     assert '\x1b' not in visible(_sentence(newest))
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(st.characters(exclude_categories=['Cs']), max_size=8)
+    | st.sampled_from(['done', 'sending', '\x1b[2J', '\x07', 10**400]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4) | st.just('objects'), inner, max_size=3),
+    max_leaves=6,
+)  # fmt: skip
+ANSWERS = st.fixed_dictionaries({}, optional=dict.fromkeys((
+    'id', 'state', 'objects', 'bytes', 'outcomes', 'lost', 'bags', 'why', 'time', 'made_ns', 'number', 'mbps', '\x1b[31m',
+), ANYTHING))  # fmt: skip
+REQUEST = PullRequest(
+    robot='thor', by='x', made_ns=LAKE_NOON_NS, expires_ns=LAKE_NOON_NS + SECOND, want=KeptFilter(sensor='camera')
+)
+
+
+@pytest.fixture(scope='module')
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with the data of a day, and a request in the mailbox of its robot."""
+    root = tmp_path_factory.mktemp('hostile-answers')
+    fill(folder_store(root), root, days=(0,))
+    inbox = root / 'store/sensor-data/_requests/thor/inbox.json'
+    inbox.parent.mkdir(parents=True)
+    inbox.write_bytes(encode_inbox([REQUEST.to_json()]))
+    return root
+
+
+def is_harmless(text: str) -> bool:
+    """No character has power over a terminal; one without a meaning in Unicode has none."""
+    return all(unicodedata.category(each) not in UNSEEN or each == '\n' for each in text)
+
+
+@settings(max_examples=40, deadline=None)
+@given(answer=ANSWERS, is_addressed=st.booleans())
+def test_any_answer_is_listed(home: Path, answer: dict[str, Any], is_addressed: bool) -> None:
+    """As text and as JSON; the request is there either way, and no control character reaches the terminal."""
+    place = home / 'store/sensor-data/thor/_answers' / REQUEST.id / '1.json'
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(json.dumps({**answer, 'id': REQUEST.id, 'state': str(answer.get('state'))} if is_addressed else answer))
+    environ = {'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': None}
+    done = CliRunner().invoke(cli, ['pull', '--list', '--robot', 'thor'], env=environ, standalone_mode=False)
+    assert done.exception is None
+    assert REQUEST.id in done.output
+    assert is_harmless(done.output)
+    done = CliRunner().invoke(cli, ['pull', '--list', '--robot', 'thor', '--json'], env=environ, standalone_mode=False)
+    assert done.exception is None
+    assert [one['id'] for one in json.loads(done.stdout)] == [REQUEST.id]
+
+
+def row(**fields: Any) -> dict[str, Any]:
+    """Of a label that is fine."""
+    one = labels.Label(robot='thor', label='stairs', since_ns=LAKE_NOON_NS, until_ns=LAKE_NOON_NS + SECOND).checked()
+    return {**{name: getattr(one, name) for name in labels.FIELDS}, 'what': 'label', 'by': 'ann', 'made_ns': LAKE_NOON_NS,
+            'made': LAKE_NOON_NS // 1000, 'format_version': 1, **fields}  # fmt: skip
+
+
+HOSTILE: dict[str, dict[str, Any]] = {
+    'a terminal escape': {'label': '\x1b[2J', 'note': '\x1b]0;x\x07', 'by': '\x9b31m'},
+    'a formula': {'label': '=HYPERLINK("http://x")', 'note': '@SUM(1)'},
+    'SQL': {'label': "x' OR '1'='1", 'id': "'; DROP TABLE objects; --"},
+    'another robot': {'robot': 'tachi'},
+    "another robot's object": {'bucket': 'sensor-data', 'key': 'tachi/camera/20261028/000000_x.jpg'},
+    'a path': {'bucket': '..', 'key': '../../../etc/passwd'},
+    'a box without end': {
+        'bucket': 'sensor-data',
+        'key': 'thor/x.jpg',
+        'x': math.nan,
+        'y': math.inf,
+        'width': -1.0,
+        'height': 0.0,
+    },
+    'a time that ends before it begins': {'since_ns': LAKE_NOON_NS, 'until_ns': 0},
+    'the last time there is': {'since_ns': -(1 << 63), 'until_ns': (1 << 63) - 1},
+    'a text without end': {'label': 'x' * 60_000, 'note': 'y' * 4000},
+    'a future that replaces everything': {'what': 'removed', 'made_ns': (1 << 63) - 1, 'id': row()['id'], 'robot': 'tachi'},
+}
+
+
+@pytest.mark.parametrize('kind', HOSTILE)
+def test_hostile_labels_affect_no_other_robot(tmp_path: Path, kind: str) -> None:
+    """The label beside it is shown, and every verb that reads labels answers without a control character."""
+    fill(folder_store(tmp_path), tmp_path, days=(0,), hours=(12,))
+    source = Bucket(folder_store(tmp_path), 'sensor-data')
+    bad_parts.put(folder_store(tmp_path), parts.encode([row()], LABELS), 'thor_good', of=LABELS)
+    bad_parts.put(folder_store(tmp_path), parts.encode([row(**{'id': 'f' * 16, **HOSTILE[kind]})], LABELS), 'thor_bad', of=LABELS)
+    assert 'stairs' in {each.label for each in labels.read(source, 'thor', findings=Findings(lambda _: None))}
+    environ = {'SHADOWHOUND_HOME': str(tmp_path), 'AWS_ENDPOINT_URL': None}
+    for arguments in (
+        ['label', 'list'], ['label', 'list', '--json'], ['query', '--label', 'stairs', '--format', 'csv'],
+        ['query', '--label', HOSTILE[kind].get('label', 'stairs'), '--json'], ['pull', '--robot', 'thor', '--label', 'stairs'],
+    ):  # fmt: skip
+        done = CliRunner().invoke(cli, arguments, env=environ, standalone_mode=False)
+        assert done.exception is None or hasattr(done.exception, 'remedy'), (arguments, done.exc_info)
+        assert is_harmless(done.output), arguments
+    assert {each.robot for each in labels.read(source, 'tachi', findings=Findings(lambda _: None))} <= set()

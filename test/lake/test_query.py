@@ -84,7 +84,7 @@ def test_flags_select_rows(
         ((89.9995, 0.0, 120.0), [5, 6]),        ((-90.0, 0.0, 2.1e7), [0, 1, 2, 3, 4, 5, 6]),
     ],
 )  # fmt: skip
-def test_near_a_place_on_earth(tmp_path: Path, near: Any, numbers: list[int]) -> None:
+def test_objects_near_a_place_on_earth_are_found(tmp_path: Path, near: Any, numbers: list[int]) -> None:
     """Around a town, across the antimeridian and around the pole; what has no place is nowhere."""
     places = ['48.1351 11.582 500', '48.1352 11.582 500', '48.1361 11.582 500', '0 179.9995 0', '0 -179.9995 nan', '89.9995 0 0',
               '89.9995 180 0', None]  # fmt: skip
@@ -96,13 +96,13 @@ def test_near_a_place_on_earth(tmp_path: Path, near: Any, numbers: list[int]) ->
 
 
 @pytest.mark.parametrize('near', ['1,2', '91,0,5', '0,181,5', '0,0,0', '0,0,nan', 'a,b,c', (0.0, 0.0)])
-def test_what_is_no_place_on_earth(world: tuple[StoreSettings, list[catalog.Row]], near: Any) -> None:
+def test_an_invalid_place_is_refused(world: tuple[StoreSettings, list[catalog.Row]], near: Any) -> None:
     """It is refused, with what would be one."""
     with pytest.raises(SettingError, match='near_gps'):
         found(Bucket(world[0], catalog.BUCKET), near_gps=near)
 
 
-def test_by_received_a_time_is_that_of_the_arrival(tmp_path: Path) -> None:
+def test_by_received_selects_by_arrival_time(tmp_path: Path) -> None:
     """A frame that arrived on the next day is of that day by arrival, and of the day of its stamp otherwise."""
     settings, late_ns = folder_store(tmp_path), 13 * 3600 * 10**9
     told = {'received_start_ns': str(NOON_NS + late_ns), 'received_end_ns': str(NOON_NS + late_ns)}
@@ -122,7 +122,7 @@ def test_by_received_a_time_is_that_of_the_arrival(tmp_path: Path) -> None:
         found(source, by='arrival')
 
 
-def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
+def test_every_column_round_trips(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
     """Names, order and values; times in UTC."""
     settings, rows = world
     answer = lake.objects(Bucket(settings, catalog.BUCKET), sensor='camera', order='t_start_ns', limit=1).to_pylist()
@@ -159,7 +159,7 @@ def test_rows_of_a_store_that_was_replaced_are_forgotten(tmp_path: Path) -> None
     assert found(Bucket(settings, catalog.BUCKET)) == keys(rows)
 
 
-def test_sql_over_the_views(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
+def test_sql_over_the_views_is_consistent(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
     """``objects``, ``topics`` and ``missions`` agree with one another, within the flags."""
     source = Bucket(world[0], catalog.BUCKET)
     day = [row for row in world[1] if catalog.date_of(row) == '2026-10-28']
@@ -177,7 +177,7 @@ def test_sql_over_the_views(world: tuple[StoreSettings, list[catalog.Row]]) -> N
 @pytest.mark.parametrize(
     'told', ['{"distance_m": 1%s}' % (400 * '0'), '{"result": "\\ud800"}', 10_000 * '[', '{"mission_type": 5}'], ids=range(4)
 )
-def test_a_senseless_summary_costs_its_own_figures_alone(tmp_path: Path, told: str) -> None:
+def test_an_invalid_summary_affects_only_its_mission(tmp_path: Path, told: str) -> None:
     """A summary may be hostile: then the mission has no end, and the others are still listed."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
@@ -190,7 +190,7 @@ def test_a_senseless_summary_costs_its_own_figures_alone(tmp_path: Path, told: s
     assert (every['odd']['distance_m'], every['odd']['success'], every['odd']['mission_type']) == (None, None, None)
 
 
-def test_a_file_that_goes_while_a_folder_is_listed_is_no_error(tmp_path: Path) -> None:
+def test_a_file_deleted_during_a_listing_is_not_an_error(tmp_path: Path) -> None:
     """As those do that a compacted one stands for."""
     settings = folder_store(tmp_path)
     rows = fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
@@ -248,7 +248,7 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
         lake.sql('SELECT * FROM gaps', source, policy='go2_patrol')
 
 
-def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path: Path) -> None:
+def test_objects_delivered_before_their_run_existed_belong_to_the_mission(tmp_path: Path) -> None:
     """How the mission ended, and its run, are known from others of its objects, which the question need not ask for."""
     settings = folder_store(tmp_path)
     rows = [each for _, few in minutes(days=(0,), hours=(11,)) for each in few]
@@ -274,7 +274,7 @@ def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path:
         lambda source: lake.sql('SELECT nope(key) FROM objects', source),
     ],
 )
-def test_what_is_no_question_is_one_kind_of_error(
+def test_every_invalid_query_is_the_same_kind_of_error(
     world: tuple[StoreSettings, list[catalog.Row]], ask: Callable[[Any], object]
 ) -> None:
     """A LakeError that says what the engine could not make sense of."""
@@ -282,7 +282,7 @@ def test_what_is_no_question_is_one_kind_of_error(
         ask(Bucket(world[0], catalog.BUCKET))
 
 
-def test_a_lake_that_is_not_there_is_empty(tmp_path: Path) -> None:
+def test_a_missing_lake_is_empty(tmp_path: Path) -> None:
     """No store yet, no catalog yet: no rows, no error."""
     source = Bucket(folder_store(tmp_path), catalog.BUCKET)
     assert found(source) == []

@@ -53,7 +53,7 @@ def answer(settings: StoreSettings, **flags: Any) -> list[str]:
     return sorted(lake.objects(Bucket(settings, catalog.BUCKET), **flags)['key'].to_pylist())
 
 
-def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
+def test_a_lost_catalog_is_rebuilt(settings: StoreSettings) -> None:
     """All rows, with what the robot would have written; a second run adds nothing."""
     found = run(settings)
     assert (found.listed, found.added, found.gone) == (9, 9, 0)
@@ -66,7 +66,7 @@ def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
     assert answer(settings) == ALL
 
 
-def test_only_what_is_missing_is_asked(settings: StoreSettings, tmp_path: Path) -> None:
+def test_only_missing_rows_are_requested(settings: StoreSettings, tmp_path: Path) -> None:
     """What the robot's parts have is listed and nothing more; what they name that is gone is counted, and stays."""
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [row('odom', stamp_ns) for stamp_ns in (*TIMES[:3], NOON_NS + 5 * SECOND)], 'part', tmp_path / 'tmp')

@@ -63,7 +63,7 @@ def missions(index: Path, text: str, **flags: object) -> list[str | None]:
     return [each['mission_id'] for each in search.search(index, text, wanted(0, **flags))]  # type: ignore[arg-type]
 
 
-def test_words_phrases_and_beginnings(index: Path) -> None:
+def test_words_phrases_and_prefixes_are_found(index: Path) -> None:
     """All words in any order, those of a phrase in its own; letters in any form; the best first."""
     assert sorted(map(str, missions(index, 'door handle'))) == ['m0', 'm1']
     assert missions(index, '"door handle"') == ['m0']
@@ -77,7 +77,7 @@ def test_words_phrases_and_beginnings(index: Path) -> None:
     assert missions(index, 'zebra') == []
 
 
-def test_the_flags_of_a_query(index: Path) -> None:
+def test_flags_restrict_the_search(index: Path) -> None:
     """Robot, time, mission, how it ended, label and ranges."""
     assert missions(index, 'door handle', success=False) == ['m1']
     assert missions(index, 'door handle', until='2026-10-28T12:30') == ['m0']
@@ -114,7 +114,7 @@ def test_an_update_reads_what_is_new(lake: Bucket, index: Path, tmp_path: Path) 
     assert search.search(fresh, 'door', wanted(0)) == search.search(index, 'door', wanted(0))
 
 
-def test_an_index_in_the_store(lake: Bucket, index: Path) -> None:
+def test_the_index_is_shared_through_the_store(lake: Bucket, index: Path) -> None:
     """It takes the place of the one before."""
     with closing(open_store(lake.settings, UploadSettings())) as store:
         search.put(store, 'sensor-data', '_search/search.db', index)
@@ -127,7 +127,7 @@ def test_an_index_in_the_store(lake: Bucket, index: Path) -> None:
 
 
 @given(st.text(max_size=40) | st.text('"*-()ORNEAD:^+ {}a\'', max_size=20))
-def test_no_query_is_obeyed(index: Path, text: str) -> None:
+def test_a_query_is_not_a_command(index: Path, text: str) -> None:
     """Whatever is typed is searched for, or refused with what is allowed: it is never a syntax error of SQLite's."""
     with suppress(SettingError):
         search.search(index, text, wanted(0))
@@ -140,7 +140,7 @@ def test_an_invalid_query_is_reported(index: Path, text: str) -> None:
         search.search(index, text, wanted(0))
 
 
-def test_a_file_that_is_no_index(tmp_path: Path, lake: Bucket) -> None:
+def test_a_file_that_is_not_an_index_is_refused(tmp_path: Path, lake: Bucket) -> None:
     """Neither a damaged file nor one with foreign tables or triggers is accepted."""
     path = tmp_path / 'search.db'
     with pytest.raises(LakeError, match='does not exist'):
@@ -182,7 +182,7 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
      ('ประตู', 'th0'), ('ห้องครัว', 'th0'), ('ห้อง', 'th0 th1'), ('ลาดตระเวน', 'th1'),
      ('küche*', 'de0'), ('kuchentur', 'de0'), ('Küchentür', 'de0'), ('tür', ''), ('부엌*', 'ko0'), ('부엌', '')],
 )  # fmt: skip
-def test_words_of_scripts_without_spaces(commands: Path, query: str, expected: str) -> None:
+def test_words_of_scripts_without_spaces_are_found(commands: Path, query: str, expected: str) -> None:
     """They are found wherever they are, one letter is enough; of compounds with letters the beginning is (decision 0023)."""
     assert sorted(map(str, missions(commands, query))) == expected.split()
 
@@ -195,7 +195,7 @@ def test_excerpts_are_verbatim(commands: Path) -> None:
         assert '\x1f' not in json.dumps(found)
 
 
-def test_labels_of_scripts_without_spaces(tmp_path: Path) -> None:
+def test_labels_of_scripts_without_spaces_are_compared_whole(tmp_path: Path) -> None:
     """The flag compares whole names, and names come back unchanged."""
     settings = folder_store(tmp_path)
     with closing(open_store(settings, UploadSettings())) as store:

@@ -16,7 +16,7 @@ MIDNIGHT_NS = NOON_NS - DAY_NS // 2
 
 
 @pytest.mark.parametrize('near', ['1,2', '1,2,0', '1,2,-3', 'a,b,c', '1,2,nan', '1,2,3,4'])
-def test_what_is_no_circle_is_refused(near: str) -> None:
+def test_an_invalid_circle_is_refused(near: str) -> None:
     """A radius is positive and all three are numbers."""
     with pytest.raises(SettingError, match='near'):
         wanted(NOON_NS, near=near)
@@ -56,7 +56,7 @@ def test_a_long_time_is_looked_up_instead() -> None:
     assert Wanted(until_ns=MIDNIGHT_NS).has_date('2026-10-27')
 
 
-def test_what_has_no_date_is_wanted_only_without_times() -> None:
+def test_rows_without_a_date_are_selected_only_without_times() -> None:
     """Objects of a boot whose clock was never set are of no day."""
     assert Wanted().has_date(UNDATED)
     assert not Wanted(until_ns=NOON_NS).has_date(UNDATED)

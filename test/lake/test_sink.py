@@ -101,7 +101,7 @@ def send(url: str, settings: StoreSettings, home: Path, *, tries: float = 3, fin
         return sink.Sink(Bucket(settings, 'sensor-data'), opened, 'robots', position, found, tries, pause=lambda _: None).send()
 
 
-def test_all_is_there_once(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_every_row_is_sent_once(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """And a second run, or one whose position is lost, adds nothing."""
     first = send(url, settings, tmp_path)
     assert (first.added, first.present, first.refused) == (sum(COUNTS.values()), 0, Counter())
@@ -115,7 +115,7 @@ def test_all_is_there_once(url: str, settings: StoreSettings, tmp_path: Path) ->
     assert oct(sink.position_path(tmp_path, url, 'robots').stat().st_mode)[-3:] == '600'
 
 
-def test_what_a_document_has(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_a_document_has_the_documented_fields(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """Times to the nanosecond, positions in meters, and a mission, its event and its error found by their words."""
     send(url, settings, tmp_path)
     ask(url, 'robots-*/_refresh', 'POST')
@@ -198,7 +198,9 @@ class Death(BaseException):
     """The process is gone."""
 
 
-def test_it_may_die_anywhere(url: str, settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sink_may_be_killed_anywhere(
+    url: str, settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Before or after any request, again and again: in the end each document is there, and once."""
     monkeypatch.setattr(sink, 'BULK_DOCUMENTS', 7)
     monkeypatch.setattr(sink, 'MISSIONS_AT_A_TIME', 2)
@@ -281,14 +283,14 @@ def between(url: str, answer: Answer) -> Iterator[tuple[str, list[Any]]]:
 @pytest.mark.parametrize(
     'fault', [(429, b'{}'), (503, b'busy'), (299, b'{"items": [')], ids=['too many requests', 'unavailable', 'breaks off']
 )
-def test_what_passes_is_tried_again(url: str, settings: StoreSettings, tmp_path: Path, fault: tuple[int, bytes]) -> None:
+def test_transient_errors_are_retried(url: str, settings: StoreSettings, tmp_path: Path, fault: tuple[int, bytes]) -> None:
     """Half of all requests fail, and nothing is lost or there twice."""
     with between(url, lambda number, _: fault if number % 2 else None) as (proxy, _):
         assert send(proxy, settings, tmp_path).refused == Counter()
     assert send(url, settings, tmp_path).added == 0
 
 
-def test_a_server_that_stays_unreachable(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_an_unreachable_server_ends_the_run(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """The error has a remedy, and what the server accepted before is recorded."""
     with between(url, lambda number, _: (429, b'{}') if number > 1 else None) as (proxy, _):
         with pytest.raises(SinkUnavailable, match='is overloaded or unavailable'):
@@ -296,7 +298,7 @@ def test_a_server_that_stays_unreachable(url: str, settings: StoreSettings, tmp_
         assert SinkUnavailable.DEFAULT_REMEDY.startswith('run it again')
 
 
-def test_single_documents(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_rejected_documents_are_counted_and_the_others_sent(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """One that has to wait is sent again alone; one that is refused is counted by reason and listed, and the others continue."""
     sizes: list[int] = []
 
@@ -351,7 +353,7 @@ def test_a_request_that_is_too_large_is_halved(url: str, settings: StoreSettings
 
 
 @pytest.mark.parametrize('answer', [b'<html>', b'{"items": []}', b'{"items": [1]}'])
-def test_an_invalid_answer(url: str, settings: StoreSettings, tmp_path: Path, answer: bytes) -> None:
+def test_an_invalid_answer_is_an_error(url: str, settings: StoreSettings, tmp_path: Path, answer: bytes) -> None:
     """Nothing counts as sent."""
     with between(url, lambda *_: (200, answer)) as (proxy, _), pytest.raises(LakeError):
         send(proxy, settings, tmp_path)
@@ -368,7 +370,7 @@ def test_an_invalid_part_is_reported_each_time(url: str, settings: StoreSettings
         assert [one.key for one in found] == ['thor/_catalog/date=2026-10-28/thor_x.jsonl.zst']
 
 
-def test_who_sends(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+def test_the_user_agent_names_this_package(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """The secret is only in a header, never in a URL or a repr; a redirect to another server is not followed."""
     with pytest.raises(SettingError, match='URL') as refused:
         sink.SearchServer('http://me:secret@127.0.0.1:9200')
@@ -390,7 +392,7 @@ def test_who_sends(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     assert len(seen) == 1
 
 
-def test_two_at_a_time(url: str, tmp_path: Path) -> None:
+def test_only_one_process_sends(url: str, tmp_path: Path) -> None:
     """The second one gets an error; an invalid prefix is refused."""
     with closing(sink.SearchServer(url)) as server, sink.opened(server, 'robots', tmp_path):
         with pytest.raises(LakeError, match='another process'), sink.opened(server, 'robots', tmp_path):
@@ -420,7 +422,7 @@ def fields(value: Any) -> Iterator[str]:
 
 
 @pytest.mark.parametrize('kind', sink.INDEXES)
-def test_dashboards(kind: str) -> None:
+def test_the_dashboards_use_existing_fields(kind: str) -> None:
     """As far as parsing shows: each reference leads to an object of the file, each field exists in documents."""
     objects = [json.loads(line) for line in (FOLDER / f'{kind}.ndjson').read_text().splitlines()]
     there = {(each['type'], each['id']) for each in objects}

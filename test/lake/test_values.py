@@ -163,7 +163,7 @@ examples = [0]
 
 @given(st.lists(MESSAGES, min_size=1, max_size=4), st.lists(CONDITIONS, min_size=4, max_size=4), st.data())
 @settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
-def test_it_is_what_a_loop_over_all_messages_finds(
+def test_the_answer_is_what_a_loop_over_all_messages_finds(
     folder: Path, batches: list[list[dict[str, Any]]], conditions: list[str], data: st.DataObject
 ) -> None:
     """With statistics of all objects, of some, or of fields that were chosen; before files of tables are merged and after it."""
@@ -184,7 +184,7 @@ BATCHES = [[{'a': 1.0 * number + place} for place in range(5)] for number in ran
 """Ten batches: 0 to 4, 1 to 5, ... 9 to 13."""
 
 
-def test_only_what_may_hold_it_is_opened(tmp_path: Path) -> None:
+def test_only_objects_that_may_match_are_opened(tmp_path: Path) -> None:
     """A batch whose messages all, or none, meet the condition is not opened; for a statistic, none is."""
     source = filled(tmp_path, BATCHES, [True] * 10)
     found = values.ranges('s.a > 11', source)
@@ -196,7 +196,7 @@ def test_only_what_may_hold_it_is_opened(tmp_path: Path) -> None:
     assert [values.ranges('max(s.a) > 12', source).opened, len(values.ranges('max(s.a) > 12', source).ranges)] == [0, 1]
 
 
-def test_what_has_no_statistics_is_unknown_until_it_is_scanned(tmp_path: Path) -> None:
+def test_objects_without_statistics_are_unknown_until_scanned(tmp_path: Path) -> None:
     """An answer says how many objects it does not know; with ``scan`` they are opened."""
     source = filled(tmp_path, BATCHES, [True] * 5 + [False] * 5)
     found = values.ranges('s.a > 11', source)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope='module')
 def browser() -> Iterator[Browser]:
-    from live.test_page import CHROMIUM, FLAGS
+    from live.browsing import CHROMIUM, FLAGS
 
     api = pytest.importorskip('playwright.sync_api')
     with (

@@ -16,7 +16,7 @@ import pytest
 from aiohttp import web
 from lake.gap_parts import lost, mark, tell
 from lake.making import NOON_NS, folder_store
-from live.test_access import serving
+from live.test_auth import serving
 from live.test_fleet import store_of
 
 from shadowhound_data_logger.core.clock import SECOND
@@ -215,7 +215,7 @@ def test_a_damaged_state_file_sends_again(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
-def test_the_conditions_of_the_robots_of_a_store(tmp_path: Path) -> None:
+def test_the_page_of_a_store_detects_the_conditions_of_its_robots(tmp_path: Path) -> None:
     """Silence, losses above a bound, objects that were deleted or are in quarantine; of a retired robot silence is unknown."""
     store_of(tmp_path, NOON_NS)
     tell(
@@ -243,7 +243,7 @@ def test_the_conditions_of_the_robots_of_a_store(tmp_path: Path) -> None:
     assert conditions(10, 3700)['thor', 'silent'] is True
 
 
-def test_the_conditions_of_this_robot(tmp_path: Path) -> None:
+def test_the_page_of_a_robot_detects_its_conditions(tmp_path: Path) -> None:
     """Its node, its disk, its quarantine, and each policy that was rolled back."""
     settings = AlertSettings(url='http://x')
     figures: dict[str, Any] = {'robot': 'thor', 'state': 'running', 'spool': {

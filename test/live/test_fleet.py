@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from lake.gap_parts import lost, mark, tell
 from lake.making import DAY_NS, NOON_NS, add_part, folder_store, row
-from live.test_page import CHROMIUM, HOSTILE, Served, fits, holds, opened
+from live.browsing import CHROMIUM, HOSTILE, Served, fits, holds, opened
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.options import UploadSettings
@@ -51,7 +51,7 @@ def robots(home: Path) -> Path:
     return home
 
 
-def test_what_needs_a_look_comes_first(robots: Path) -> None:
+def test_robots_that_need_attention_come_first(robots: Path) -> None:
     """Losses of today, then what is fine, then what is off; of a robot that is silent for long the last day is known."""
     found = overview(Bucket(folder_store(robots), 'sensor-data'), Findings(lambda _: None), NOON_NS + 60 * SECOND)
     told = [(one.robot, one.state(NOON_NS + 60 * SECOND)[0], sum(one.lost.values())) for one in found]
@@ -79,7 +79,7 @@ def test_data_that_the_robot_had_and_lost_is_worse(robots: Path) -> None:
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
-def test_the_table_of_robots(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_table_of_robots_is_ordered_and_leads_to_each(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In their order, with names as text; a click shows the past of that robot."""
     store_of(home, time.time_ns() - 10 * SECOND)
     settings = LiveSettings(spool=home / 'none', robot='thor', tokens=home / 'live', port=0, is_of_store=True)
@@ -107,7 +107,7 @@ NAMES = ('\u202egnp.exe', '\x1b]0;title\x07\x00', 'mission ' * 1250, '\u05d0\u05
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
-def test_hostile_names_of_missions(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_names_of_missions_are_text(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the table of robots, on the timeline and in the choice of a mission they are text on one line, cut where it is long."""
     now_ns = time.time_ns() - 60 * SECOND
     with closing(open_store(folder_store(home), UploadSettings())) as store:

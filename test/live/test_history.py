@@ -131,7 +131,7 @@ def asked(history: PastReader, at_s: float, by: str = 'stamp') -> tuple[dict[str
     return head, items(body)
 
 
-def test_the_past_of_a_store(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+def test_the_past_of_a_store_is_shown(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
     """What was recorded, the gaps in their causes, how far that is known, the mission; and a moment as it was."""
     patrol(store, tmp_path)
     settings = folder_store(tmp_path)
@@ -241,7 +241,7 @@ def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_pat
         assert other['shown'] == []
 
 
-def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+def test_the_past_of_a_spool_is_shown(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
     """What waits is read from the spool, what was delivered from the store."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
@@ -445,7 +445,7 @@ def test_kept_data_is_shown_and_requested(store: ObjectStore, opened: Opened, tm
             asked('pull', cancel='0' * 32, by='viewer')
 
 
-def test_what_a_spool_keeps_is_asked_of_its_node(store: ObjectStore, opened: Opened, tmp_path: Path,
+def test_data_kept_in_a_spool_is_requested_from_its_node(store: ObjectStore, opened: Opened, tmp_path: Path,
                                                  monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """On the robot the index says how much that is; the node is asked, whose request is one as any other."""
     with closing(Field(tmp_path)) as field:
@@ -488,7 +488,7 @@ def test_an_unreachable_store_delays_no_timeline(opened: Opened, store: ObjectSt
     {'do': 'days', 'robot': '../x'}, {'do': 'timeline', 'robot': 'thor', 'from': 0, 'to': 10**14},
     {'do': 'read', 'robot': 'thor'}, {'do': 'moment', 'robot': 'thor', 'at': 10**14 * 9}, {},
 ])  # fmt: skip
-def test_what_is_no_question_is_refused(opened: Opened, question: dict[str, Any]) -> None:
+def test_an_invalid_question_is_refused(opened: Opened, question: dict[str, Any]) -> None:
     """By an error that the process goes on after."""
     with pytest.raises((ValueError, OverflowError)):
         opened(StorePast()).answer(question)
@@ -566,7 +566,7 @@ def test_a_timeline_of_a_spool_has_every_pause(store: ObjectStore, opened: Opene
     assert pauses(part['recorded'], topic) == [(late_s + 45, late_s + 49), (late_s + 60, late_s + 60), (late_s + 80, late_s + 81)]
 
 
-def test_what_was_delivered_late_and_what_waits(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+def test_late_and_waiting_objects_are_listed(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
     """Of an outage of the store from 10 s on, which ended after two minutes: until when it waited; and of what waits now."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
@@ -601,7 +601,7 @@ def ran(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, cwd=folder, env=dict(os.environ), capture_output=True, text=True, check=False, timeout=240)
 
 
-def test_the_commands_of_a_time_run(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+def test_the_commands_for_a_time_run(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
     """Query finds what is there, fetch and bag cut make files, export names the mission."""
     patrol(store, tmp_path)
     name = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
@@ -624,7 +624,7 @@ def test_the_commands_of_a_time_run(store: ObjectStore, opened: Opened, tmp_path
     assert 'm1' in told.stdout + told.stderr
 
 
-def test_what_is_kept_can_be_pulled_with_the_command(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+def test_the_command_pulls_kept_data(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
     """It is told only where something of the time is on the robot."""
     with closing(Field(tmp_path)) as field:
         field.records(*range(6))
@@ -660,7 +660,7 @@ def test_a_plot_keeps_its_range_where_a_bag_covers_the_moment(store: ObjectStore
     assert (figures == figures[0]).all()
 
 
-def test_what_the_live_view_begins_with(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+def test_the_live_view_starts_with_recorded_values(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
     """Series, path and battery of the spool, with the times that live items have: of a clock that only this machine knows."""
     spool = new_spool(tmp_path / 'spool', FakeClock())
     spool.open()

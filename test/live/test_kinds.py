@@ -65,7 +65,7 @@ def image(pixels: Any, kind: str, **changed: Any) -> bytes:
     return cdr(new(IMAGE, **{**given, **changed}), IMAGE)
 
 
-def test_points_come_back_within_half_a_step() -> None:
+def test_points_round_trip_within_half_a_step() -> None:
     """uint16 in the box of the cloud; points that are not finite are left out."""
     points = np.random.default_rng(1).uniform(-30, 30, (20_000, 3)).astype('<f4')
     points[7] = np.nan
@@ -253,7 +253,7 @@ def test_joints_that_are_not_as_usual_are_read_by_field() -> None:
 
 
 @pytest.mark.parametrize('size', [-1, -8, 60, 20, 1])
-def test_what_is_cut_is_rejected(size: int) -> None:
+def test_truncated_messages_are_rejected(size: int) -> None:
     """Even where all that is shown is there."""
     for name, whole in ((ODOMETRY, odometry('odom', 1)), (JOINTS, joints(['a', 'b'], np.zeros(2), np.zeros(2)))):
         with pytest.raises(Rejected):
@@ -285,7 +285,7 @@ def joints(names: list[str], position: Any, velocity: Any = ()) -> bytes:
                    effort=np.zeros(0)), JOINTS)  # fmt: skip
 
 
-def test_a_head_is_json_whatever_is_in_it() -> None:
+def test_a_header_is_valid_json_whatever_it_contains() -> None:
     """Half a surrogate, of a name that somebody relays, and an integer that no other reader takes are written all the same."""
     packed = LiveItem('/a', 'topics', head={'problem': 'ö', 'rate': float('nan')}).packed
     assert opened(packed)[0] == {'topic': '/a', 'kind': 'topics', 'problem': 'ö', 'rate': None}

@@ -15,7 +15,7 @@ import pytest
 import simplejpeg
 from aiohttp import web
 from e2e.live_frames import Frames
-from live.test_access import Page, serving
+from live.test_auth import Page, serving
 from live.test_kinds import of_too_many_pixels
 
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE

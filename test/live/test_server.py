@@ -11,7 +11,7 @@ from typing import Any
 import aiohttp
 import pytest
 from e2e.live_frames import Frames
-from live.test_access import UPGRADE, serving
+from live.test_auth import UPGRADE, serving
 from spool.making import FakeClock
 from spool.test_status import written
 
@@ -97,7 +97,7 @@ def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypat
     assert 'has its spool in SHADOWHOUND_HOME/spool' in asyncio.run(told(tmp_path / 'copy'))['error']
 
 
-def test_who_watches_from_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viewers_on_other_machines_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Viewers and players of RTSP alike; on the page of a store nobody does."""
     robot, store = closed_server(tmp_path), closed_server(tmp_path, is_of_store=True)
     assert not robot.viewers.is_watched_remotely
@@ -113,7 +113,7 @@ def test_who_watches_from_another_machine(tmp_path: Path, monkeypatch: pytest.Mo
                 assert not store.viewers.is_watched_remotely
 
 
-def test_video_is_suggested_to_who_has_had_a_narrow_link_for_a_while(tmp_path: Path) -> None:
+def test_video_is_suggested_on_a_link_that_stays_narrow(tmp_path: Path) -> None:
     """Each time that it was narrow for ten seconds without a break; not without a camera, and not where there is no video."""
     told: list[LiveItem] = []
     viewer = Viewer()

@@ -81,7 +81,7 @@ def all_of(browser: Browser) -> list[dict[str, Any]]:
             return found
 
 
-def test_an_item_arrives_as_it_was(browser: Browser) -> None:
+def test_an_item_arrives_unchanged(browser: Browser) -> None:
     """Its head and its body, whatever was cut into frames."""
     browser.viewer.offer(frame(7))
     (item,) = all_of(browser)
@@ -105,7 +105,7 @@ def test_a_browser_that_reads_nothing_is_sent_a_window_and_holds_one_item_a_topi
     assert browser.viewer.replaced > 400
 
 
-def test_small_items_go_before_what_is_left_of_a_large_one(browser: Browser) -> None:
+def test_small_items_are_sent_before_the_rest_of_a_large_one(browser: Browser) -> None:
     """A row that comes while a frame is under way is in the next frame of the WebSocket."""
     browser.viewer.offer(frame(1))
     assert browser.read(2) == []
@@ -113,7 +113,7 @@ def test_small_items_go_before_what_is_left_of_a_large_one(browser: Browser) -> 
     assert [item['topic'] for item in browser.read(1)] == ['/imu']
 
 
-def test_small_items_go_together(browser: Browser) -> None:
+def test_small_items_are_sent_together(browser: Browser) -> None:
     """In one frame, of each topic in turn, as long as it is small; the rest in the next."""
     for number in range(3):
         for topic in ('/imu', '/odom'):
@@ -179,7 +179,7 @@ def test_an_acknowledgement_of_what_was_not_sent_opens_no_window(browser: Browse
     assert browser.received - before <= MAX_CHUNK + 4
 
 
-def test_what_is_not_watched_any_more_is_not_sent(browser: Browser) -> None:
+def test_topics_that_are_no_longer_watched_are_not_sent(browser: Browser) -> None:
     """A hidden tab watches nothing, and gets at most what was begun."""
     browser.viewer.watch(['/camera', '/imu'])
     browser.viewer.offer(row(1))
@@ -227,7 +227,7 @@ class Link:
 
 
 @pytest.mark.parametrize('round_s', [0.0, 0.02, 0.1, 0.25])
-def test_a_long_way_is_filled(now: list[float], round_s: float) -> None:
+def test_a_link_with_a_long_round_trip_is_filled(now: list[float], round_s: float) -> None:
     """However far the robot is, a link that carries everything does: in full size, and small items are as late as the way is."""
     viewer = Viewer(lambda: now[0])
     viewer.round_s = round_s
@@ -299,7 +299,7 @@ def test_with_video_frames_of_large_items_are_sized_by_their_share(browser: Brow
     assert len(sent) == int(4e6 * BESIDE_VIDEO * CHUNK_S) + 4
 
 
-def test_small_items_go_while_a_window_is_full(browser: Browser) -> None:
+def test_small_items_are_sent_while_a_window_is_full(browser: Browser) -> None:
     """They do not wait until a large one is acknowledged; for who acknowledges nothing, that ends."""
     browser.viewer.offer(frame(1, 400_000))
     browser.read()

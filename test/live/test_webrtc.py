@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import simplejpeg
-from live.test_access import Page, serving
+from live.test_auth import Page, serving
 
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
 from shadowhound_data_logger.live import cameras as cameras_module

@@ -33,7 +33,7 @@ def test_a_mission_is_active_from_start_to_end(tmp_path: Path) -> None:
     assert not over.has((over.end_ns or 0) + 1)
 
 
-def test_only_its_own_robot_is_looked_for(tmp_path: Path) -> None:
+def test_only_missions_of_the_same_robot_are_found(tmp_path: Path) -> None:
     """Several robots may share a home."""
     with journalling(tmp_path, robot='tachi') as logger:
         logger.start_mission('patrol', 'go')
@@ -54,7 +54,7 @@ def test_the_newest_of_several_is_active(tmp_path: Path) -> None:
         assert (found and found.id) == older
 
 
-def test_a_mission_that_is_being_made_is_not_over(tmp_path: Path) -> None:
+def test_a_mission_that_is_being_created_is_not_over(tmp_path: Path) -> None:
     """Until the folder has a locked journal with a first record, it is checked again."""
     finder = MissionFinder(tmp_path, 'thor')
     folder = new_folder(tmp_path, 'patrol', 1)
@@ -69,7 +69,7 @@ def test_a_mission_that_is_being_made_is_not_over(tmp_path: Path) -> None:
     assert finder.active() is None
 
 
-def test_what_is_over_costs_one_stat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ended_mission_costs_one_stat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Old missions are not opened again."""
     for _ in range(3):
         with journalling(tmp_path) as logger:

@@ -49,7 +49,7 @@ def original(name: str) -> str:
     return found.decode('utf-8', 'surrogateescape')
 
 
-def test_names_that_mlflow_holds_are_kept_and_others_changed() -> None:
+def test_names_that_mlflow_allows_are_kept_and_others_changed() -> None:
     """As docs/missions.md says."""
     assert [artifact_name(name) for name in KEPT] == list(KEPT)
     assert {name: artifact_name(name) for name in CHANGED} == CHANGED
@@ -208,7 +208,7 @@ def folder(tmp_path: Path) -> MissionFolder:
 OTHERS = {'b', 'c', 'd', 'e', 'events.jsonl', 'summary.json'}
 
 
-def test_what_the_server_refuses_is_counted_with_its_reason(folder: MissionFolder) -> None:
+def test_refused_artifacts_are_counted_with_their_reason(folder: MissionFolder) -> None:
     """It is skipped once the server accepts others; the mission is complete, and its report contains what is missing and why."""
     tracking = Picky(lambda name: name != 'bad', lambda: TrackingUnavailable('404 for bad', remedy='', of_object=True))
     assert deliver(folder, tracking).sent.complete
@@ -218,7 +218,7 @@ def test_what_the_server_refuses_is_counted_with_its_reason(folder: MissionFolde
 
 
 @pytest.mark.parametrize('error', [TrackingUnavailable('500 for bad', remedy=''), OSError(5, 'Input/output error')])
-def test_what_fails_for_another_reason_delays_no_other(folder: MissionFolder, error: Exception) -> None:
+def test_an_artifact_that_fails_delays_no_other(folder: MissionFolder, error: Exception) -> None:
     """A server's own error, a broken connection or disk: all others arrive, and it is tried again until it does too."""
     broken = True
     tracking = Picky(lambda name: name != 'bad' or not broken, lambda: error)
@@ -238,7 +238,7 @@ def test_what_fails_for_another_reason_delays_no_other(folder: MissionFolder, er
     assert set(tracking.artifacts) == OTHERS | {'bad'}
 
 
-def test_a_server_that_takes_nothing_is_not_believed(folder: MissionFolder) -> None:
+def test_a_server_that_refuses_everything_is_not_believed(folder: MissionFolder) -> None:
     """A proxy that answers 404 to everything does not refuse an artifact: all of them wait for the server."""
     away = True
     tracking = Picky(lambda _: not away, lambda: TrackingUnavailable('404', remedy='', of_object=True))
@@ -261,7 +261,7 @@ def test_a_restart_in_between_loses_nothing(folder: MissionFolder) -> None:
 
 @pytest.mark.seaweedfs
 @pytest.mark.long('waits for what does not come')
-def test_an_artifact_with_the_name_of_a_folder(server: Server, warm_home: Path, tmp_path: Path) -> None:
+def test_an_artifact_with_the_name_of_a_folder_is_renamed(server: Server, warm_home: Path, tmp_path: Path) -> None:
     """Where the server cannot hold both, the rest of the mission is there, and the report names the one that is not."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     run_id = logger.start_mission('patrol', 'a clash')

@@ -178,7 +178,7 @@ def test_an_endpoint_that_no_client_can_use_is_an_invalid_setting(
     MissionDataLogger(home=tmp_path, replay=False).close()
 
 
-def test_the_working_directory_was_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_deleted_working_directory_does_not_stop_the_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An absolute home still works; a relative one is an invalid setting."""
     gone = tmp_path / 'gone'
     gone.mkdir()
@@ -195,7 +195,7 @@ def test_the_working_directory_was_deleted(tmp_path: Path, monkeypatch: pytest.M
         end_replayers(tmp_path / 'home')
 
 
-def test_no_thread_can_be_started(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mission_is_journaled_when_no_thread_can_be_started(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mission is still logged, and synced when the logger is closed."""
 
     def refuse(_: threading.Thread) -> None:
@@ -227,7 +227,7 @@ print(run_id)
 @pytest.mark.parametrize(('uri', 'made'), [
     ('sqlite:///mlflow.db', 'mlflow.db'), ('file:mlruns', 'mlruns'), ('./mlruns', 'mlruns'), ('mlruns', 'mlruns'),
 ])  # fmt: skip
-def test_relative_paths_are_of_the_agent_s_folder(tmp_path: Path, home: Path, uri: str, made: str) -> None:
+def test_relative_paths_are_relative_to_the_agents_folder(tmp_path: Path, home: Path, uri: str, made: str) -> None:
     """A store for MLflow, a home, and PYTHONPATH; modules in the agent's folder do not replace Python's own."""
     work = tmp_path / 'work'
     (work / 'agent').mkdir(parents=True)

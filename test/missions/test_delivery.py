@@ -169,7 +169,7 @@ def test_the_run_is_looked_up_after_a_lost_answer(tmp_path: Path) -> None:
     assert list(tracking.runs) == [folder.mission_id]
 
 
-def test_what_the_server_refuses_is_skipped_and_counted(tmp_path: Path) -> None:
+def test_refused_records_are_skipped_and_counted(tmp_path: Path) -> None:
     """One bad point does not keep the others of its batch."""
     folder = fly(tmp_path, points=50)
     tracking = FakeTracking(refuses=lambda point: point.key == 'battery_pct' and point.step == 33)
@@ -179,7 +179,7 @@ def test_what_the_server_refuses_is_skipped_and_counted(tmp_path: Path) -> None:
     assert tracking.params['duration_s'] == '60.000'
 
 
-def test_a_deleted_run_is_not_made_again(tmp_path: Path) -> None:
+def test_a_deleted_run_is_not_created_again(tmp_path: Path) -> None:
     """The user who deletes a run does not want it: the mission stops, and reports why."""
     tracking = FakeTracking(gone=True)
     delivery = Delivery(fly(tmp_path), tracking, FakeSpooler())  # type: ignore[arg-type]
@@ -188,7 +188,7 @@ def test_a_deleted_run_is_not_made_again(tmp_path: Path) -> None:
     assert tracking.points == []
 
 
-def test_artifacts_that_do_not_arrive_hold_up_no_metric(tmp_path: Path) -> None:
+def test_artifacts_that_fail_delay_no_metric(tmp_path: Path) -> None:
     """The run is whole and ended while its artifacts wait, and the mission is not complete."""
     folder = fly(tmp_path)
     tracking = FakeTracking(fail=lambda name: name == 'artifact')

@@ -30,7 +30,7 @@ def records(path: Path, offset: int = 0) -> list[object]:
     return [line.record for line in read(path, offset)]
 
 
-def test_it_is_read_as_it_was_written(journal: Journal) -> None:
+def test_a_journal_is_read_as_it_was_written(journal: Journal) -> None:
     """Records come back in order, floats to the last bit, and reading continues at the end of any line."""
     said = [{'k': 'metrics', 'm': {'a': 0.1 + 0.2}, 't': 1 << 60}, {'k': 'event', 'name': 'Küche\n\0'}, {'k': 'end'}]
     for record in said:
@@ -41,7 +41,7 @@ def test_it_is_read_as_it_was_written(journal: Journal) -> None:
     assert ends[-1] == journal.path.stat().st_size
 
 
-def test_a_torn_line_costs_itself(journal: Journal) -> None:
+def test_a_torn_line_costs_only_itself(journal: Journal) -> None:
     """An incomplete line is skipped until it is complete; one that never becomes complete is damaged."""
     journal.append({'a': 1})
     with journal.path.open('ab') as file:
@@ -67,7 +67,7 @@ def test_a_record_after_a_full_disk_is_complete(journal: Journal, monkeypatch: p
 
 @settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 400), st.integers(1, 255))
-def test_rot_is_seen(tmp_path_factory: pytest.TempPathFactory, place: int, flip: int) -> None:
+def test_corruption_is_detected(tmp_path_factory: pytest.TempPathFactory, place: int, flip: int) -> None:
     """Of a journal with a changed byte, every record that is read is one that was written, and at most two are missing."""
     said = [{'k': 'metrics', 'n': number, 'v': number / 7} for number in range(10)]
     data = bytearray(b''.join(map(line_of, said)))
@@ -79,7 +79,7 @@ def test_rot_is_seen(tmp_path_factory: pytest.TempPathFactory, place: int, flip:
     assert len(found) >= len(said) - 2
 
 
-def test_threads_share_it(journal: Journal) -> None:
+def test_threads_share_a_journal(journal: Journal) -> None:
     """Records of many threads do not mix, and each thread's stay in order."""
     threads = [
         threading.Thread(target=lambda me=me: [journal.append({'me': me, 'n': n, 'x': 'y' * 99}) for n in range(200)])
@@ -95,7 +95,7 @@ def test_threads_share_it(journal: Journal) -> None:
         assert [record['n'] for record in found if record['me'] == me] == list(range(200))  # type: ignore[index]
 
 
-def test_a_living_writer_is_known(journal: Journal) -> None:
+def test_a_running_writer_is_detected(journal: Journal) -> None:
     """No process can finish the journal while its writer has it open; afterwards any process can."""
     with abandoned(journal.path) as descriptor:
         assert descriptor is None
@@ -104,7 +104,7 @@ def test_a_living_writer_is_known(journal: Journal) -> None:
         assert descriptor is not None
 
 
-def test_a_dead_writer_is_known_whatever_it_forked(tmp_path: Path) -> None:
+def test_an_exited_writer_is_detected_whatever_it_forked(tmp_path: Path) -> None:
     """A killed writer's lock is free although a process that it forked lives on."""
     program = """
 import os, signal, sys
@@ -135,7 +135,7 @@ signal.pause()
         writer.stdout.close()
 
 
-def test_the_last_record_replaces_what_is_torn(journal: Journal) -> None:
+def test_the_last_record_replaces_a_torn_one(journal: Journal) -> None:
     """Finishing cuts half a record off and says how much that was."""
     journal.append({'a': 1})
     end = journal.path.stat().st_size
@@ -148,7 +148,7 @@ def test_the_last_record_replaces_what_is_torn(journal: Journal) -> None:
     assert records(journal.path) == [{'a': 1}, {'k': 'end'}]
 
 
-def test_syncing_does_not_hold_up_writers(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_syncing_does_not_delay_writers(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
     """Records are appended while the disk is busy with a sync."""
     entered, leave = threading.Event(), threading.Event()
     monkeypatch.setattr(os, 'fsync', lambda _: (entered.set(), leave.wait(60)))
@@ -168,7 +168,7 @@ def test_other_users_cannot_read_the_journal(journal: Journal) -> None:
     assert journal.path.stat().st_mode & 0o077 == 0
 
 
-def test_a_journal_is_made_once(journal: Journal) -> None:
+def test_a_journal_is_created_once(journal: Journal) -> None:
     """A second one under the same name is refused, and the first keeps its lock."""
     with pytest.raises(FileExistsError):
         Journal(journal.path).create()

@@ -1,8 +1,13 @@
-"""MissionDataLogger as the agent uses it: nothing it says is lost, and nothing that goes wrong reaches the mission."""
+"""MissionDataLogger as the agent uses it: nothing it says is lost, and nothing that goes wrong reaches the mission.
+
+The lifecycle of a logger: its thread and files, forks, and closing.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
+import multiprocessing
 import os
 import re
 import threading
@@ -13,6 +18,7 @@ import pytest
 from missions.fakes import journal, journalling, journals
 
 from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.missions import copies
 from shadowhound_data_logger.missions.folder import MISSIONS, missions
 from shadowhound_data_logger.missions.mission import Mission
@@ -20,7 +26,7 @@ from shadowhound_data_logger.missions.mission import Mission
 JPEG = b'\xff\xd8 a picture \xff\xd9'
 
 
-def test_the_guide_s_calls_are_journalled(tmp_path: Path) -> None:
+def test_the_guides_calls_are_journaled(tmp_path: Path) -> None:
     """Each call of the integration guide, by its own argument names, is a record when it returns."""
     csv = tmp_path / 't.csv'
     csv.write_text('timestamp,x,y,yaw\n')
@@ -43,7 +49,7 @@ def test_the_guide_s_calls_are_journalled(tmp_path: Path) -> None:
     assert times == sorted(times)
 
 
-def test_a_failure_is_the_run_s_state(tmp_path: Path) -> None:
+def test_a_failure_is_the_state_of_the_run(tmp_path: Path) -> None:
     """``success=False`` ends it as FAILED."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -82,7 +88,7 @@ def test_an_exception_ends_the_mission_and_propagates(tmp_path: Path) -> None:
     assert (end['status'], end['success'], end['error']) == ('FAILED', False, 'ZeroDivisionError: oh')
 
 
-def test_a_with_that_ends_well_is_a_success(tmp_path: Path) -> None:
+def test_a_with_block_that_ends_normally_is_a_success(tmp_path: Path) -> None:
     """Leaving ``with`` ends the mission as FINISHED, unless the agent has ended it."""
     with journalling(tmp_path) as logger:
         with logger.mission('a', ''):
@@ -122,7 +128,7 @@ class Mute(Exception):
 @pytest.mark.parametrize(
     'value', [math.nan, math.inf, None, 'twelve', '12', [1, 2], object(), 10**400, pytest.param(10**5000, id='huge'), Mute()]
 )
-def test_what_is_no_number_is_counted(tmp_path: Path, value: Any) -> None:
+def test_a_value_that_is_not_a_number_is_counted(tmp_path: Path, value: Any) -> None:
     """The invalid value is skipped and counted, and the rest of the call is logged."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -149,7 +155,7 @@ def test_a_bad_metric_name_is_counted(tmp_path: Path, key: Any) -> None:
 
 
 @pytest.mark.parametrize('path', ['/nowhere', '', 'a\0b', None, 3.5, '/dev/zero', '/tmp'])  # noqa: S108
-def test_what_is_no_file_is_counted(tmp_path: Path, path: Any) -> None:
+def test_a_missing_file_is_counted(tmp_path: Path, path: Any) -> None:
     """No artifact, and no error in the mission."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -193,7 +199,7 @@ def test_events_hold_anything_but_files(tmp_path: Path) -> None:
     assert end['status'] == 'FINISHED'
 
 
-def test_what_has_no_text_is_named_by_its_class(tmp_path: Path) -> None:
+def test_an_object_without_text_is_named_by_its_class(tmp_path: Path) -> None:
     """In an event, as a name, a command, or as the exception that ends a mission, which propagates unchanged."""
 
     def fly(logger: MissionDataLogger, mute: Any) -> None:
@@ -229,7 +235,7 @@ def test_a_full_disk_does_not_reach_the_mission(
     assert [record['k'] for record in journal(tmp_path)] == ['start', 'metrics', 'end']
 
 
-def test_little_room_is_kept_for_the_journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_little_space_only_the_journal_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames and artifacts stop before the disk is full, metrics do not."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -240,7 +246,7 @@ def test_little_room_is_kept_for_the_journal(tmp_path: Path, monkeypatch: pytest
     assert [record['k'] for record in journal(tmp_path)] == ['start', 'metrics', 'end']
 
 
-def test_a_home_that_cannot_be_written_costs_the_log_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_read_only_home_costs_only_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The agent gets an id and continues; the log contains that the mission is not logged."""
     (tmp_path / 'file').write_text('')
     with journalling(tmp_path / 'file') as logger:
@@ -285,3 +291,111 @@ def test_frames_are_sampled_for_the_run(tmp_path: Path) -> None:
         for number in range(5):
             logger.log_camera_frame(JPEG, number)
     assert [record['artifact'] for record in journal(tmp_path) if record['k'] == 'frame'] == [True, False, False, False, False]
+
+
+def _in_a_fork(logger: MissionDataLogger) -> None:
+    logger.log_metric('from the child', 1.0)
+    logger.close()
+
+
+@pytest.mark.filterwarnings('ignore:This process .* is multi-threaded')
+def test_a_fork_has_no_mission(tmp_path: Path) -> None:
+    """A forked child's calls do nothing, and the parent's mission continues."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        child = multiprocessing.get_context('fork').Process(target=_in_a_fork, args=(logger,))
+        child.start()
+        child.join(60)
+        assert child.exitcode == 0
+        logger.log_metric('a', 1.0)
+    assert [record['k'] for record in journal(tmp_path)] == ['start', 'metrics', 'end']
+
+
+def _frame_in_a_fork(mission: Mission, path: Path) -> None:
+    mission.log_camera_frame(b'of the child', 7)
+    mission.log_artifact(path)
+
+
+@pytest.mark.filterwarnings('ignore:This process .* is multi-threaded')
+def test_a_fork_touches_no_file_of_the_mission(tmp_path: Path) -> None:
+    """A child that has the mission itself in hand writes none."""
+    with journalling(tmp_path) as logger, logger.mission('patrol', '') as mission:
+        files = mission.folder.files
+        child = multiprocessing.get_context('fork').Process(target=_frame_in_a_fork, args=(mission, Path(__file__)))
+        child.start()
+        child.join(60)
+        assert child.exitcode == 0
+        assert list(files.iterdir()) == []
+        mission.log_camera_frame(JPEG, 0)
+    assert [path.read_bytes() for path in files.iterdir()] == [JPEG]
+
+
+def test_calls_after_the_end_write_no_file(tmp_path: Path) -> None:
+    """It would never be sent."""
+    with journalling(tmp_path) as logger:
+        with logger.mission('patrol', '') as mission:
+            pass
+        mission.close()
+        mission.log_camera_frame(JPEG, 0)
+        mission.log_artifact(__file__)
+        assert list(mission.folder.files.iterdir()) == []
+
+
+def test_closing_ends_the_mission_as_killed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A logger that is closed in a mission says so; closing twice is the same as once."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.close()
+        logger.close()
+    assert [record.get('status') for record in journal(tmp_path)] == [None, 'KILLED']
+    assert logging.WARNING in {record.levelno for record in caplog.records}
+
+
+def test_a_robot_name_is_checked_immediately(tmp_path: Path) -> None:
+    """The constructor refuses a name that cannot be the first part of a key, before any mission."""
+    with pytest.raises(SettingError, match='robot'):
+        MissionDataLogger(robot='../thor', home=tmp_path, replay=False)
+
+
+def test_an_invalid_home_is_rejected_immediately(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the node refuses it: a user without a home, in a container say, has to name the folder."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', '~no-such-user/x')
+    with pytest.raises(SettingError, match='SHADOWHOUND_HOME'):
+        MissionDataLogger(replay=False)
+
+
+def test_logged_records_are_synced_within_a_quarter_of_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread syncs the frame, its folder and then the journal, soon after a call and without another one."""
+    synced: list[str] = []
+    done = threading.Event()
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_camera_frame(JPEG, 0)
+        fsync = os.fsync
+
+        def note(descriptor: int) -> None:
+            file = Path(f'/proc/self/fd/{descriptor}').readlink()
+            synced.append('the frame' if file.is_file() and file.read_bytes() == JPEG + b'1' else file.name)
+            fsync(descriptor)
+            if synced[-1] == 'journal' and 'the frame' in synced:  # the one before may be on its way as well
+                done.set()
+
+        monkeypatch.setattr(os, 'fsync', note)
+        logger.log_camera_frame(JPEG + b'1', 1)
+        assert done.wait(60.0)
+    start = synced.index('the frame')
+    assert synced[start : start + 3] == ['the frame', 'files', 'journal']
+
+
+def test_a_disk_that_is_full_at_the_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mission continues unlogged, and the journal without a record is closed."""
+
+    def full(*_: object) -> int:
+        raise OSError(28, 'No space left on device')
+
+    with journalling(tmp_path) as logger:
+        with monkeypatch.context() as patched:
+            patched.setattr(os, 'write', full)
+            assert logger.start_mission('patrol', '').endswith('_unlogged')
+        opened = [path.resolve() for path in Path('/proc/self/fd').iterdir()]
+        assert not [path for path in opened if path.is_relative_to(tmp_path / MISSIONS)]

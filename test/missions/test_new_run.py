@@ -56,7 +56,7 @@ def test_a_mission_has_its_run_before_mlflow_is_loaded(server: Server, home: Pat
 
 
 @pytest.mark.seaweedfs
-def test_the_call_costs_one_request(server: Server, warm_home: Path) -> None:
+def test_starting_a_mission_costs_one_request(server: Server, warm_home: Path) -> None:
     """The experiment is looked for by the constructor, and both take little CPU; bench/mission_calls.py measures the time."""
     heard = bytearray()
     with Wire(server.tower.tracking_uri, heard.extend) as wire:
@@ -169,7 +169,7 @@ def test_a_run_that_was_not_saved_is_found(server: Server, warm_home: Path, monk
 
 @pytest.mark.seaweedfs
 @pytest.mark.long('a sender of its own')
-def test_a_server_behind_tls(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_is_created_behind_tls(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With an authority whose file is named relative to the agent's folder: for the run, and for all that the sender sends."""
     authority = Authority(tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -207,7 +207,7 @@ class Clock:
         return self.seconds
 
 
-def test_the_sender_waits_for_the_agent_s_request(folder: MissionFolder) -> None:
+def test_the_sender_waits_for_the_agents_request(folder: MissionFolder) -> None:
     """Until then it sends and creates nothing, and then uses the agent's run."""
     new, tracking = NewRun(folder), FakeTracking()
     delivery = Delivery(folder, tracking, FakeSpooler())  # type: ignore[arg-type]
@@ -221,7 +221,7 @@ def test_the_sender_waits_for_the_agent_s_request(folder: MissionFolder) -> None
 
 
 @pytest.mark.parametrize('how', ['failed', 'killed', 'hung'])
-def test_the_sender_creates_it_where_the_agent_could_not(folder: MissionFolder, how: str) -> None:
+def test_the_sender_creates_the_run_when_the_agent_could_not(folder: MissionFolder, how: str) -> None:
     """After a failure, the agent's death, or half a minute."""
     new, tracking, clock = NewRun(folder), FakeTracking(), Clock()
     delivery = Delivery(folder, tracking, FakeSpooler(), monotonic=clock)  # type: ignore[arg-type]
@@ -238,7 +238,7 @@ def test_the_sender_creates_it_where_the_agent_could_not(folder: MissionFolder, 
         new.settle()
 
 
-def test_the_sender_stays_for_the_agent_s_request(tmp_path: Path, folder: MissionFolder) -> None:
+def test_the_sender_keeps_running_for_the_agents_request(tmp_path: Path, folder: MissionFolder) -> None:
     """Even if the agent has closed its logger before its request ends, the mission is still sent."""
     new, tracking = NewRun(folder), FakeTracking()
     replay = Replay(tmp_path, tracking, FakeSpooler(), FakePictures())  # type: ignore[arg-type]
@@ -251,7 +251,7 @@ def test_the_sender_stays_for_the_agent_s_request(tmp_path: Path, folder: Missio
     assert folder.sent().complete
 
 
-def test_a_file_system_that_locks_no_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_folder_locks_is_supported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Missions are logged and sent as if there were no shortcut."""
     is_locked = journal.is_locked
 
@@ -272,7 +272,7 @@ def test_a_file_system_that_locks_no_folders(tmp_path: Path, monkeypatch: pytest
     assert not delivery._agent_creates_run()
 
 
-def test_a_fork_does_not_hold_the_mission(folder: MissionFolder) -> None:
+def test_a_fork_does_not_keep_the_mission_open(folder: MissionFolder) -> None:
     """A process that was forked during the request has a copy of the lock, which ends with the request."""
     new = NewRun(folder)
     copy = os.dup(new._descriptor)  # as a forked process has it

@@ -49,7 +49,7 @@ def distances(mission: ActiveMission) -> list[float]:
     return [record['m']['distance_traveled_m'] for record in records(mission) if 'distance_traveled_m' in record.get('m', {})]
 
 
-def test_poses_of_several_threads_come_into_order(mission: ActiveMission) -> None:
+def test_poses_of_several_threads_are_sorted(mission: ActiveMission) -> None:
     """Whichever encoder is faster: no way is counted twice and none is lost."""
     node_log, poses = opened(mission), walk(mission, range(60))
     rng = random.Random(1)
@@ -63,7 +63,7 @@ def test_poses_of_several_threads_come_into_order(mission: ActiveMission) -> Non
     assert written == [[pose.stamp_ns, pose.x, pose.y, pose.yaw, pose.z] for pose in poses]
 
 
-def test_facts_of_another_time_are_skipped(mission: ActiveMission) -> None:
+def test_readings_outside_the_mission_are_skipped(mission: ActiveMission) -> None:
     """Before the start, and at the end after the end."""
     node_log = opened(mission)
     for second in (-1, 1, 9):
@@ -100,7 +100,7 @@ def test_two_nodes_do_not_write_one_journal(mission: ActiveMission) -> None:
     opened(mission).close()
 
 
-def test_the_floor_is_what_the_lidar_saw(mission: ActiveMission) -> None:
+def test_the_floor_plan_is_what_the_lidar_saw(mission: ActiveMission) -> None:
     """Neither ground nor ceiling nor another frame's points, and a node that comes later adds to it."""
     cloud = np.array([[1, 2, 0.5], [3, 4, 0.0], [5, 6, 2.0], [np.nan, 1, 1]], np.float32)
     for second in range(2):
@@ -113,7 +113,7 @@ def test_the_floor_is_what_the_lidar_saw(mission: ActiveMission) -> None:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_the_floor_stays_small() -> None:
+def test_the_floor_plan_stays_small() -> None:
     """However long the mission is; what remains is of all of it."""
     floor, rng = FloorPlan(), np.random.default_rng(1)
     for second in range(500):
@@ -140,7 +140,7 @@ def test_a_full_disk_costs_a_warning(
     assert caplog.text.count('no space') == 1
 
 
-def test_little_room_costs_frames_alone(mission: ActiveMission, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_little_space_only_frames_are_skipped(mission: ActiveMission, monkeypatch: pytest.MonkeyPatch) -> None:
     """Records after a lost frame in the same second are still journaled."""
     node_log = opened(mission)
     monkeypatch.setattr(copies, 'MIN_FREE_BYTES', 1 << 60)

@@ -20,12 +20,12 @@ def walked(*steps: tuple[float, float, float], frame_id: str = 'odom', max_speed
     return odometer
 
 
-def test_a_way_is_the_sum_of_its_steps() -> None:
+def test_a_distance_is_the_sum_of_its_steps() -> None:
     """There and back again counts twice."""
     assert walked((0, 0, 0), (1, 3, 0), (2, 3, 4), (3, 3, 0)).distance_m == pytest.approx(3 + 4 + 4)
 
 
-def test_a_drone_is_fast() -> None:
+def test_a_fast_drone_is_counted() -> None:
     """At 15 m/s its way counts, but for the first step; a jump on the way does not, nor an estimate that jumps back and forth."""
     odometer = Odometer()
     for number in range(101):
@@ -37,19 +37,19 @@ def test_a_drone_is_fast() -> None:
     assert (odometer.distance_m, odometer.jumps) == (0.0, 10)
 
 
-def test_a_jump_is_no_way() -> None:
+def test_a_jump_is_not_counted() -> None:
     """A step faster than the robot is not counted, and the path continues after it."""
     odometer = walked((0, 0, 0), (1, 1, 0), (2, 100, 0), (3, 101, 0))
     assert (odometer.distance_m, odometer.jumps) == (pytest.approx(2), 1)
 
 
-def test_a_jump_after_a_rest_is_no_way_either() -> None:
+def test_a_jump_after_a_rest_is_not_counted() -> None:
     """However long the robot stood: the jump itself took one period."""
     rest = [(number / 10, 0.001 * (number % 2), 0.0) for number in range(600)]
     assert walked(*rest, (60.0, 8, 0), (60.1, 8.2, 0)).distance_m == pytest.approx(0.2)
 
 
-def test_another_frame_is_another_origin() -> None:
+def test_another_frame_has_another_origin() -> None:
     """Between poses of two frames lies no way."""
     odometer = walked((0, 0, 0), (1, 1, 0))
     odometer.add(Pose(2 * SECOND, 2.0, 0.0, 0.0, frame_id='map'))
@@ -57,13 +57,13 @@ def test_another_frame_is_another_origin() -> None:
     assert odometer.distance_m == pytest.approx(2)
 
 
-def test_noise_at_rest_is_no_way() -> None:
+def test_noise_at_rest_is_not_counted() -> None:
     """A minute of millimetres at 50 Hz is nothing."""
     rng = random.Random(1)
     assert walked(*((number / 50, rng.gauss(0, 0.002), rng.gauss(0, 0.002)) for number in range(3000))).distance_m < 0.1
 
 
-def test_slow_walking_at_a_high_rate_is_all_counted() -> None:
+def test_slow_walking_at_a_high_rate_is_counted() -> None:
     """Steps below the noise add up."""
     assert walked(*((number / 200, number * 0.001, 0.0) for number in range(2001))).distance_m == pytest.approx(2.0, abs=0.03)
 

@@ -45,7 +45,7 @@ def said(folder: MissionFolder) -> Report:
     return found
 
 
-def test_no_process_sends_it(folder: MissionFolder) -> None:
+def test_a_mission_that_no_process_sends_is_named(folder: MissionFolder) -> None:
     """The command that does is named."""
     found = said(folder)
     assert found.waiting_for == 'a sender'
@@ -53,14 +53,14 @@ def test_no_process_sends_it(folder: MissionFolder) -> None:
 
 
 @pytest.mark.usefixtures('sender')
-def test_nothing_is_sent_yet(folder: MissionFolder) -> None:
+def test_a_mission_of_which_nothing_was_sent_is_named(folder: MissionFolder) -> None:
     """Records, artifacts and objects are counted."""
     waiting_for = said(folder).waiting_for
     assert waiting_for == '5 records to be in its run, 2 artifacts to be in its run, 1 objects to be in the spool'
 
 
 @pytest.mark.usefixtures('sender')
-def test_its_pictures_are_being_made(folder: MissionFolder) -> None:
+def test_a_mission_waits_while_its_plots_are_drawn(folder: MissionFolder) -> None:
     """Even if every record is in the run and there is no error."""
     delivery = new(folder, make_pictures=lambda *_: None)
     for _ in range(10):
@@ -74,7 +74,7 @@ def test_its_pictures_are_being_made(folder: MissionFolder) -> None:
 
 
 @pytest.mark.usefixtures('sender')
-def test_the_node_has_not_finished(folder: MissionFolder) -> None:
+def test_a_mission_waits_for_its_node(folder: MissionFolder) -> None:
     """Its journal is still being written."""
     folder.node.path.mkdir()
     with ExitStack() as stack:
@@ -87,7 +87,7 @@ def test_the_node_has_not_finished(folder: MissionFolder) -> None:
 
 
 @pytest.mark.usefixtures('sender')
-def test_what_delays_it_is_the_error(folder: MissionFolder) -> None:
+def test_the_error_that_delays_a_mission_is_shown(folder: MissionFolder) -> None:
     """What the sender says of the server stands before what was refused earlier."""
     folder.set_sent(folder.sent().__class__(error='an artifact was refused', unattached=1))
     write_json(
@@ -118,7 +118,7 @@ def test_a_complete_mission_waits_for_nothing(folder: MissionFolder) -> None:
     assert (found.complete, found.waiting_for, found.remedy, found.refused, found.last_error) == (True, '', '', 1, 'no')
 
 
-def test_a_missing_journal(folder: MissionFolder) -> None:
+def test_a_missing_journal_is_reported(folder: MissionFolder) -> None:
     """The report says so, and does not raise."""
     folder.journal.unlink()
     assert 'missing' in said(folder).waiting_for

@@ -47,7 +47,7 @@ def path(count: int = 50) -> str:
     return 'timestamp,x,y,yaw\n' + ''.join(f'{1e9 + n / 10},{n / 20},{n % 7 / 100},0\n' for n in range(count))
 
 
-def test_a_mission_has_three_pictures(tmp_path: Path) -> None:
+def test_a_mission_has_three_images(tmp_path: Path) -> None:
     """All of a width, with the floor plan where there is one, and nothing to say about them."""
     folder = fly(tmp_path, frames=7, rows=path())
     np.save(folder.floor, np.random.default_rng(1).uniform(-3, 3, (500, 2)).astype(np.float32))
@@ -60,7 +60,7 @@ def test_a_mission_has_three_pictures(tmp_path: Path) -> None:
             assert len(set(image.convert('L').tobytes())) > 10
 
 
-def test_a_picture_that_cannot_be_made_costs_only_itself(tmp_path: Path) -> None:
+def test_an_image_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None:
     """The note contains the reason, and the other pictures exist."""
     folder = fly(tmp_path, frames=2, broken=1, rows='timestamp,x,y\n1,nan,2\nx,1,2\n')
     folder.floor.write_bytes(b'no array')
@@ -72,7 +72,7 @@ def test_a_picture_that_cannot_be_made_costs_only_itself(tmp_path: Path) -> None
     assert sorted(path.name for path in folder.files.iterdir() if path.name in NAMES) == ['battery.png', 'camera_summary.jpg']
 
 
-def test_a_mission_without_anything_has_no_pictures(tmp_path: Path) -> None:
+def test_an_empty_mission_has_no_images(tmp_path: Path) -> None:
     """Nothing is drawn without data, and the notes contain the reasons."""
     folder = fly(tmp_path, frames=0, states=1)
     assert make(folder, 'patrol_1') == {
@@ -81,7 +81,7 @@ def test_a_mission_without_anything_has_no_pictures(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_the_node_s_data_replace_missing_ones(tmp_path: Path) -> None:
+def test_the_nodes_data_replace_missing_data(tmp_path: Path) -> None:
     """What the agent did not log is taken from the node, and only that."""
     folder = fly(tmp_path, frames=0, states=3)
     folder.node.files.mkdir(parents=True)
@@ -114,7 +114,7 @@ def test_a_trajectory_is_read(tmp_path: Path, text: str, expected: list[tuple[fl
     assert read_path(tmp_path / 't.csv') == expected
 
 
-def test_a_speed_is_no_noise() -> None:
+def test_a_speed_plot_has_no_noise() -> None:
     """Centimetres of noise at 20 Hz do not make a robot that walks at 0.5 m/s a runner; time that stands gives no speed."""
     from shadowhound_data_logger.missions.plots import _speed  # loads matplotlib, for which only the worker that runs it waits
 
@@ -125,7 +125,7 @@ def test_a_speed_is_no_noise() -> None:
 
 
 @pytest.mark.long('a process that imports much')
-def test_a_process_draws(tmp_path: Path) -> None:
+def test_a_separate_process_draws(tmp_path: Path) -> None:
     """It blocks no process; its notes are kept, and a later sender does not draw again."""
     folder = fly(tmp_path, rows=path())
     here = PictureProcess()
@@ -155,7 +155,7 @@ def test_a_process_that_fails_is_reported(tmp_path: Path, monkeypatch: pytest.Mo
     assert not here.busy
 
 
-def test_a_mission_waits_for_its_pictures(tmp_path: Path) -> None:
+def test_a_mission_waits_for_its_images(tmp_path: Path) -> None:
     """They are artifacts of its run, and the summary says what became of them, as artifact and as object."""
     folder = fly(tmp_path)
     answers = iter([None, None])

@@ -71,7 +71,7 @@ def test_all_missions_are_sent(tmp_path: Path) -> None:
 
 
 @pytest.mark.long('an hour of a simulated outage')
-def test_an_outage_is_probed_ever_more_rarely(tmp_path: Path) -> None:
+def test_an_outage_is_probed_less_and_less_often(tmp_path: Path) -> None:
     """At most one request a round, pauses up to a minute; the state says what is wrong and what to do, until it is over."""
     for _ in range(5):
         fly(tmp_path)
@@ -192,7 +192,7 @@ def test_pauses_grow_to_a_minute_and_end_with_a_success() -> None:
     assert gate.error is None
 
 
-def test_it_ends_after_its_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sender_exits_after_its_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At once when all is sent; after ten minutes when nothing gets through."""
     fly(tmp_path)
     now = Now()
@@ -213,7 +213,7 @@ def test_it_ends_after_its_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     os.close(reader)
 
 
-def test_a_byte_wakes_it() -> None:
+def test_a_byte_wakes_the_sender() -> None:
     """And the end of its input is that of the agent."""
     reader, writer = os.pipe()
     parent = AgentProcess(reader)
@@ -226,7 +226,7 @@ def test_a_byte_wakes_it() -> None:
     os.close(reader)
 
 
-def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
+def test_a_second_sender_waits_and_exits_with_its_agent(tmp_path: Path) -> None:
     """One a home sends."""
     (tmp_path / MISSIONS).mkdir()
     with flock(tmp_path / MISSIONS / 'replay.lock', wait=False) as mine:
@@ -240,7 +240,7 @@ def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
         assert waiting.wait(60.0) == 0
 
 
-def test_one_whose_agent_has_exited_yields_to_another(tmp_path: Path) -> None:
+def test_a_sender_whose_agent_has_exited_yields_to_another(tmp_path: Path) -> None:
     """It yields as soon as another sender waits, but not while its own agent runs; a hanging request ends with its process."""
     waiting, ends = tmp_path / 'replay.waiting', threading.Event()
     reader, writer = os.pipe()
@@ -262,7 +262,7 @@ def test_one_whose_agent_has_exited_yields_to_another(tmp_path: Path) -> None:
 
 
 @pytest.mark.long('two processes that load MLflow')
-def test_a_corrected_address_is_used_though_an_earlier_sender_is_stuck(tmp_path: Path) -> None:
+def test_a_corrected_address_is_used_although_an_earlier_sender_is_stuck(tmp_path: Path) -> None:
     """The address of an agent that was killed answers nothing; the sender of the next agent takes over and sends the mission."""
     mission_id = fly(tmp_path)
     command = [sys.executable, '-m', 'shadowhound_data_logger.missions.replay', '--home', str(tmp_path), '--experiment', 'x']
@@ -282,7 +282,7 @@ def test_a_corrected_address_is_used_though_an_earlier_sender_is_stuck(tmp_path:
         until(lambda: MissionFolder(tmp_path / MISSIONS / mission_id).sent().complete, 'the mission is sent', 120.0)
 
 
-def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_logger_restarts_the_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sender that dies is restarted after a pause, is never a zombie, and does not remain after its logger."""
     monkeypatch.setattr('shadowhound_data_logger.missions.child.RESTART_PAUSE_S', 0.1)
     monkeypatch.setattr('shadowhound_data_logger.missions.child.interpreter', lambda: '/bin/false')
@@ -297,7 +297,7 @@ def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize('what', ['journal', 'artifact'])
-def test_one_that_always_fails_blocks_no_other(tmp_path: Path, what: str) -> None:
+def test_a_mission_that_always_fails_blocks_no_other(tmp_path: Path, what: str) -> None:
     """A journal that the disk does not give back, an artifact that the server never gets: the older missions arrive."""
     for number in range(3):
         older = tmp_path / MISSIONS / fly(tmp_path)
@@ -349,7 +349,7 @@ def test_a_full_disk_does_not_end_the_sender(tmp_path: Path, monkeypatch: pytest
     assert read_json(tmp_path / MISSIONS / 'replay.json')['errors'] == {}
 
 
-def test_a_mission_that_cannot_be_looked_at_stops_no_other(tmp_path: Path) -> None:
+def test_an_unreadable_mission_stops_no_other(tmp_path: Path) -> None:
     """If its disk fails or another process deletes it at that moment, the others are still sent."""
     rotten, whole = fly(tmp_path), fly(tmp_path)
 

@@ -1,21 +1,33 @@
-"""What ``end_mission`` states is what MLflow shows of the run, whatever was logged under the same names before."""
+"""What ``end_mission`` states is what MLflow shows of the run, whatever was logged under the same names before.
+
+Who ran what: a mission says which policies were active, in their order.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from missions.fakes import FakeSpooler, FakeTracking, journalling
+from click.testing import CliRunner
+from missions.fakes import FakeSpooler, FakeTracking, journalling, journals
 from missions.server import Server
+from PIL import Image
 
 from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.folder import MissionFolder, missions
+from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, missions
 from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.missions.pictures import make
+from shadowhound_data_logger.missions.state import MAX_POLICIES, MissionState, summary_of
 from shadowhound_data_logger.missions.tracking import MlflowTracking
 from shadowhound_data_logger.missions.values import MAX_STEP
+from shadowhound_data_logger.policies.folder import PolicyFolder
 
 KEYS = ('success', 'duration_s', 'distance_m', 'distance_traveled_m', 'battery_consumed_pct')
 STEPS = (0, 1, 5, -3, 1 << 31, (1 << 31) + 1, MAX_STEP - 1, MAX_STEP, -MAX_STEP)
@@ -44,7 +56,7 @@ def deliver(folder: MissionFolder, tracking: MlflowTracking | FakeTracking) -> s
 
 @pytest.mark.filterwarnings('ignore')
 @pytest.mark.parametrize('store', ['sqlite', 'file'])
-def test_what_is_stated_is_what_a_local_store_shows(tmp_path: Path, store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_local_store_shows_the_stated_values(tmp_path: Path, store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """At every step that MLflow takes."""
     monkeypatch.setenv('MLFLOW_ALLOW_FILE_STORE', 'true')
     uri = f'sqlite:///{tmp_path}/mlflow.db' if store == 'sqlite' else f'file://{tmp_path}/mlruns'
@@ -60,7 +72,7 @@ def test_what_is_stated_is_what_a_local_store_shows(tmp_path: Path, store: str, 
 
 
 @pytest.mark.seaweedfs
-def test_what_is_stated_is_what_a_server_shows(server: Server, warm_home: Path) -> None:
+def test_a_server_shows_the_stated_values(server: Server, warm_home: Path) -> None:
     """Also in its list of runs, which can be sorted by it."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     logger.start_mission('patrol', 'stated')
@@ -70,7 +82,7 @@ def test_what_is_stated_is_what_a_server_shows(server: Server, warm_home: Path) 
     assert {key: shown[key] for key in KEYS} == EXPECTED
 
 
-def test_the_clock_was_set_back(tmp_path: Path) -> None:
+def test_stated_values_are_the_newest_after_the_clock_was_set_back(tmp_path: Path) -> None:
     """The last point is the newest by its step, though its time is before that of the others."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -108,3 +120,109 @@ def test_logged_values_are_used_if_none_are_stated(
     deliver(next(missions(tmp_path)), tracking)
     newest = max((point for point in tracking.points if point.key == 'distance_m'), key=lambda point: (point.step, point.time_ms))
     assert newest.value == json.loads(tracking.artifacts['summary.json'])['distance_m'] == expected
+
+
+OLD, NEW = 'go2_patrol@6#fedcba9876543210', 'go2_patrol@7#0123456789abcdef'
+
+
+@pytest.fixture
+def logger(tmp_path: Path) -> Iterator[MissionDataLogger]:
+    PolicyFolder(tmp_path).make()
+    made = MissionDataLogger(home=tmp_path, robot='thor', replay=False, start_timeout_s=0.0)
+    yield made
+    made.close()
+
+
+def activate(home: Path, name: str | None) -> None:
+    """As a rollback does, of a version that need not be there."""
+    PolicyFolder(home)._link(name)
+
+
+def told_of(home: Path) -> list[tuple[MissionState, dict[str, Any]]]:
+    """The story and the summary of each mission, the first one first."""
+    stories = []
+    for records in journals(home):
+        story = MissionState()
+        for record in records:
+            story.add(record)
+        stories.append((story, summary_of(story, 'mission', Run('run', '1', ''), MissionSent(), {})))
+    return sorted(stories, key=lambda told: told[1]['start_ns'])
+
+
+def test_a_mission_records_the_active_policy(tmp_path: Path, logger: MissionDataLogger) -> None:
+    """In the params of its run and in its summary; one that had none says none."""
+    for name in (None, NEW):
+        activate(tmp_path, name)
+        logger.start_mission(f'patrol_{name is not None}', 'go round')
+        logger.end_mission(True, 1.0, 2.0)
+    told = [(story.params().get('policy'), story.final_params().get('policies'), summary['policy'], summary['policies'],
+             summary['policy_changes']) for story, summary in told_of(tmp_path)]  # fmt: skip
+    assert told == [(None, None, None, None, []), (NEW, None, NEW, NEW, [])]
+
+
+def test_a_rollback_during_a_mission_is_recorded(tmp_path: Path, logger: MissionDataLogger) -> None:
+    """Both policies in their order and when it was; also where the agent logs nothing after it, and where none is left."""
+    activate(tmp_path, NEW)
+    logger.start_mission('patrol', 'go round')
+    picture = io.BytesIO()
+    Image.new('RGB', (64, 48), 'teal').save(picture, 'JPEG')
+    logger.log_camera_frame(picture.getvalue(), 1)
+    mission = logger._mission
+    assert mission is not None
+    for name in (OLD, None):
+        activate(tmp_path, name)
+        mission.sync()  # as the thread of the logger does ten times a second
+        mission.sync()
+    activate(tmp_path, OLD)
+    logger.end_mission(False, 1.0, 2.0)
+    every = f'{NEW}, {OLD}, none, {OLD}'
+    ((story, summary),) = told_of(tmp_path)
+    assert (story.params()['policy'], story.final_params()['policies']) == (NEW, every)
+    assert (summary['policy'], summary['policies']) == (NEW, every)
+    assert [change['policy'] for change in summary['policy_changes']] == [OLD, None, OLD]
+    times = [summary['start'], *(change['time'] for change in summary['policy_changes']), summary['end']]
+    assert times == sorted(times)
+    (folder,) = missions(tmp_path)
+    run = CliRunner(env={'SHADOWHOUND_HOME': str(tmp_path), 'COLUMNS': '200'})
+    assert every in run.invoke(cli, ['missions', 'show', folder.mission_id]).output
+    assert json.loads(run.invoke(cli, ['missions', 'show', folder.mission_id, '--json']).output)['policies'] == every
+    heights = []
+    for is_told in (True, False):
+        assert make(folder, 'patrol')['camera_summary.jpg'] == ''
+        with Image.open(folder.files / 'camera_summary.jpg') as sheet:
+            heights.append(sheet.height)
+        if is_told:
+            folder.journal.write_bytes(b''.join(
+                line for line in folder.journal.read_bytes().splitlines(keepends=True) if b'"policy"' not in line))  # fmt: skip
+    assert heights[0] > heights[1], 'the sheet has a line for them'
+
+
+def test_a_policy_that_keeps_changing_is_bounded(tmp_path: Path) -> None:
+    story = MissionState()
+    story.add({'k': 'start', 't': 0, 'type': 'patrol', 'command': '', 'robot': 'thor', 'policy': NEW})
+    for number in range(10 * MAX_POLICIES):
+        story.add({'k': 'policy', 't': number, 'policy': (OLD, NEW)[number % 2]})
+    assert len(story.policies) == MAX_POLICIES
+    assert story.final_params()['policies'].startswith(f'{NEW}, {OLD}, {NEW}')
+
+
+def test_a_full_disk_delays_the_record_of_policies(
+    tmp_path: Path, logger: MissionDataLogger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is recorded as soon as there is free space, and does not count as lost."""
+    activate(tmp_path, NEW)
+    logger.start_mission('patrol', 'go round')
+    mission = logger._mission
+    assert mission is not None
+
+    def full(_: object) -> None:
+        raise OSError(28, 'No space left on device')
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mission._recorder._journal, 'append', full)
+        activate(tmp_path, OLD)
+        mission.sync()
+    logger.end_mission(True, 1.0, 2.0)
+    ((story, summary),) = told_of(tmp_path)
+    assert summary['policies'] == f'{NEW}, {OLD}'
+    assert story.end['lost'] == 0

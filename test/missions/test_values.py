@@ -65,7 +65,7 @@ def test_gray_pixels_that_begin_as_a_jpeg_does_are_pixels(tmp_path: Path, value:
     (b'\x89PNG\r\n\x1a\n', 'encode it'), (b'', 'encode it'), (memoryview(b'\xff'), 'encode it'), ('a.jpg', 'encode it'),
     (None, 'encode it'), (3, 'encode it'), ([[1, 2]], 'encode it'), (np.frombuffer(b'\x89PNG', np.uint8), 'height'),
 ])  # fmt: skip
-def test_what_is_no_image_is_refused_at_the_call(
+def test_data_that_is_not_an_image_is_refused_at_the_call(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, value: Any, remedy: str
 ) -> None:
     """It is counted by its reason, and the warning says what to do."""
@@ -97,7 +97,7 @@ def test_one_element_is_a_number(tmp_path: Path, value: Any) -> None:
     np.array([1.0, 2.0]), np.array([]), np.array(['2.5']), np.array([1j]), np.datetime64('2025-10-18'), np.timedelta64(1, 's'),
     np.array([None]), np.array([np.nan]), np.array([b'2']),
 ])  # fmt: skip
-def test_an_array_that_is_no_number_is_refused(tmp_path: Path, value: Any) -> None:
+def test_an_array_that_is_not_a_number_is_refused(tmp_path: Path, value: Any) -> None:
     """More or fewer elements, texts, times and complex numbers."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')

@@ -31,7 +31,9 @@ def planned(*publishers: tuple[bool, bool]) -> list[tuple[bool, bool]]:
         ([(False, True)], [BEST_EFFORT]),  # there is nothing to repeat a history with
     ],
 )
-def test_every_publisher_can_serve_one(publishers: list[tuple[bool, bool]], subscriptions: list[tuple[bool, bool]]) -> None:
+def test_every_publisher_can_serve_one_of_the_subscriptions(
+    publishers: list[tuple[bool, bool]], subscriptions: list[tuple[bool, bool]]
+) -> None:
     """There is one subscription for each kind of publisher, asking for no more than it offers."""
     assert planned(*publishers) == subscriptions
 
@@ -81,7 +83,7 @@ def test_the_history_covers_a_stall(type_name: str, messages: int) -> None:
     ('sensor_msgs/msg/CompressedImage', 2_000_000, 30, 16),
     ('sensor_msgs/msg/Image', 921_656, 30, 32), ('sensor_msgs/msg/Image', 6_220_856, 30, 16),
 ])  # fmt: skip
-def test_the_history_is_sized_from_what_is_heard(type_name: str, size: int, rate_hz: float, messages: int) -> None:
+def test_the_history_is_sized_from_the_received_rate(type_name: str, size: int, rate_hz: float, messages: int) -> None:
     """Two seconds of messages at the rate at which they come and of the size that they have; it settles at once and stays."""
     history = HistoryDepth(type_name)
     depths = []
@@ -100,7 +102,7 @@ def test_a_full_history_grows() -> None:
     assert history.depth == 4096
 
 
-def test_a_stall_is_no_rate() -> None:
+def test_a_stall_does_not_count_as_a_rate() -> None:
     """What gathered while nobody took came in the whole time since the last drain; a first drain counts as one poll at least."""
     history = HistoryDepth(TYPE)
     history.observe([40] * 3000, 1.5)
@@ -109,7 +111,7 @@ def test_a_stall_is_no_rate() -> None:
     assert history.depth == 4000
 
 
-def test_a_plan_in_words() -> None:
+def test_a_plan_is_logged_in_words() -> None:
     """The log says how a topic is listened to."""
     assert (
         Plan('/odom', TYPE, reliable=True, transient_local=False, depth=400).describe() == f'/odom ({TYPE}, RELIABLE, depth 400)'
@@ -140,7 +142,7 @@ def test_a_successor_is_distinguished_from_its_predecessor() -> None:
     assert first[0] != second[0]
 
 
-def test_two_that_the_graph_does_not_show_yet_are_not_taken_for_a_gap() -> None:
+def test_two_undiscovered_publishers_are_not_mistaken_for_a_gap() -> None:
     """Numbers that begin anew and then go on where the old ones were come from two publishers: nobody's, and no loss of one."""
     senders = Senders()
     senders.poll(['a'])
@@ -149,7 +151,7 @@ def test_two_that_the_graph_does_not_show_yet_are_not_taken_for_a_gap() -> None:
     assert senders.name(6, 200) is None
 
 
-def test_a_successor_that_overtakes_its_predecessor_is_one() -> None:
+def test_a_successor_that_overtakes_its_predecessor_is_recognized() -> None:
     """It is told apart for as long as it publishes, also when it loses a message after that."""
     senders = Senders()
     senders.poll(['a'])

@@ -105,7 +105,7 @@ def test_librcl_and_rclpy_agree(node: Any, monkeypatch: pytest.MonkeyPatch, *, l
 
 @needs_fast_dds
 @pytest.mark.usefixtures('through_librcl')
-def test_takes_through_librcl_are_proved_once(node: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_takes_through_librcl_are_verified_once(node: Any, caplog: pytest.LogCaptureFixture) -> None:
     """With messages of the node to itself, on a topic that is gone afterwards, and one line says so."""
     caplog.set_level('INFO')
     readers = [read(node, f'/proved{number}') for number in range(3)]
@@ -121,7 +121,9 @@ def test_takes_through_librcl_are_proved_once(node: Any, caplog: pytest.LogCaptu
     ('version', 'needs_librcl'),
     [((3, 3, 15), True), ((7, 1, 6), True), ((9, 1, 0), True), ((9, 1, 1), False), ((9, 1, 2), False), ((10, 0, 0), False)],
 )
-def test_who_needs_librcl(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...], *, needs_librcl: bool) -> None:
+def test_librcl_is_used_where_rclpy_lacks_information(
+    node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...], *, needs_librcl: bool
+) -> None:
     """Humble, Jazzy, and the Kilted of its first weeks: their rclpy does not tell whose a message is."""
     monkeypatch.setattr(reader, 'rclpy_version', lambda: version)
     monkeypatch.setattr(reader, '_VERIFIED', {})
@@ -166,7 +168,7 @@ def test_an_empty_message_is_skipped(
     found.close()
 
 
-def test_what_came_before_an_empty_message_is_taken(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_before_an_empty_message_are_taken(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where no other subscription can be made, which the next drain tries again."""
     found = read(node, '/refused')
     kept = found._subscription
@@ -192,7 +194,7 @@ def test_what_came_before_an_empty_message_is_taken(node: Any, monkeypatch: pyte
 
 @needs_fast_dds
 @pytest.mark.parametrize('version', [(), (99,)])
-def test_what_is_behind_an_empty_message_is_taken(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...]) -> None:
+def test_messages_after_an_empty_message_are_taken(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...]) -> None:
     """Anybody in the network may send some: they cost neither the messages behind them nor the subscription."""
     monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', version)
     found = read(node, '/hollow')
@@ -255,7 +257,7 @@ def test_incorrect_message_info_is_not_trusted(
 
 
 @pytest.mark.usefixtures('through_librcl')
-def test_a_librcl_without_what_is_asked_is_left_alone(
+def test_a_librcl_without_the_functions_is_not_used(
     node: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As one of a distribution to come might be; with Cyclone DDS nothing is asked at all, as it has no numbers."""
@@ -273,7 +275,7 @@ def test_a_librcl_without_what_is_asked_is_left_alone(
 
 @needs_fast_dds
 @pytest.mark.usefixtures('through_librcl')
-def test_what_the_history_overwrote_is_a_gap_in_the_numbers(node: Any) -> None:
+def test_overwritten_messages_are_a_gap_in_the_numbers(node: Any) -> None:
     """Of what was published while nobody took, the last messages come, with their own numbers."""
     found = read(node, '/full', depth=5)
     publisher = node.create_publisher(String, '/full', 100)

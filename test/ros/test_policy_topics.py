@@ -97,7 +97,9 @@ def test_a_policy_is_published_evaluated_and_rolled_back(scene: Scene, listener:
         listener.until(lambda: listener.heard[-1] == '', 'none is active')
 
 
-def test_what_cannot_be_judged_stays(scene: Scene, listener: Listener, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_policy_that_cannot_be_evaluated_stays_active(
+    scene: Scene, listener: Listener, caplog: pytest.LogCaptureFixture
+) -> None:
     """A manifest that is not there any more: the fault is told, and the topics go on."""
     now = scene.folder.current()
     assert now is not None

@@ -64,7 +64,7 @@ def leave(shm: Path, *listeners: int, name: str = PORT, has_lock: bool = True, *
 
 @pytest.mark.parametrize(('name', 'mutex'), [(PORT, MUTEX), ('fastdds_port17411', OTHER_MUTEX)])
 @pytest.mark.parametrize('flags', [DEAD, IN_USE, DEAD | WAITING])
-def test_a_dead_listener_waits_from_now_on(shm: Path, name: str, mutex: int, flags: int) -> None:
+def test_a_dead_listener_is_marked_as_waiting(shm: Path, name: str, mutex: int, flags: int) -> None:
     """It is one byte that changes, once, and only when it is asked for; on both machines, of both names."""
     path = leave(shm, flags, name=name, mutex=mutex)
     before = path.read_bytes()
@@ -76,7 +76,7 @@ def test_a_dead_listener_waits_from_now_on(shm: Path, name: str, mutex: int, fla
     assert settle(shm) == []
 
 
-def test_who_lives_is_left_alone(shm: Path) -> None:
+def test_running_listeners_are_left_alone(shm: Path) -> None:
     """However busy it is, and also where Fast DDS has marked its port."""
     for is_ok in (True, False):
         path = leave(shm, DEAD, is_ok=is_ok)
@@ -85,7 +85,7 @@ def test_who_lives_is_left_alone(shm: Path) -> None:
         assert first(path) == DEAD
 
 
-def test_without_a_lock_only_what_is_marked(shm: Path) -> None:
+def test_without_a_lock_only_marked_ports_are_changed(shm: Path) -> None:
     """A publisher that stands still has removed the lock's file before."""
     path = leave(shm, DEAD, has_lock=False)
     assert settle(shm) == []
@@ -105,7 +105,7 @@ def test_without_a_lock_only_what_is_marked(shm: Path) -> None:
         segment(PROCESSING), b'x', b'\2\0\0\0', segment(DEAD).ljust(5 << 20, b'\0'),
     ],
 )  # fmt: skip
-def test_what_is_not_as_expected_is_left_alone(shm: Path, data: bytes) -> None:
+def test_an_unexpected_layout_is_left_alone(shm: Path, data: bytes) -> None:
     """Another ABI, another architecture, numbers that do not fit together, half a port, two of them: not a byte is written."""
     path = leave(shm)
     path.write_bytes(data)
@@ -114,7 +114,7 @@ def test_what_is_not_as_expected_is_left_alone(shm: Path, data: bytes) -> None:
     assert path.read_bytes() == data
 
 
-def test_what_is_no_port_of_ours_is_left_alone(
+def test_ports_of_other_programs_are_left_alone(
     shm: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Links, pipes, other names, and what belongs to another user."""
@@ -252,7 +252,7 @@ def test_a_blocked_publisher_continues(pair: Callable[[bool], Pair]) -> None:
 
 @pytest.mark.ros
 @pytest.mark.long('a kill')
-def test_a_guard_settles_before_fast_dds_notices(pair: Callable[[bool], Pair]) -> None:
+def test_a_guard_acts_before_fast_dds_notices(pair: Callable[[bool], Pair]) -> None:
     """So the publisher never stands still, at whatever moment Fast DDS marks the port."""
     two = pair(True)
     assert two.publishes()
@@ -265,7 +265,7 @@ def test_a_guard_settles_before_fast_dds_notices(pair: Callable[[bool], Pair]) -
     assert two.publishes()
 
 
-def test_the_guard_needs_nothing_of_the_package() -> None:
+def test_the_guard_imports_nothing_of_the_package() -> None:
     """It runs where Python finds no package."""
     command = [sys.executable, '-I', '-S', str(port_guard.__file__), '0']
     assert subprocess.run(command, check=False, capture_output=True).returncode == 0

@@ -42,7 +42,7 @@ def test_only_unowned_segments_are_freed(shm: Path) -> None:
         assert orphans(shm, free=True) == []
 
 
-def test_what_belongs_to_another_user_stays(shm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_segments_of_another_user_are_kept(shm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever may remove it: root, say."""
     before, mine = names(shm), os.geteuid()
     monkeypatch.setattr(os, 'geteuid', lambda: mine + 1)
@@ -67,7 +67,7 @@ def test_an_unrelated_lock_is_ignored(shm: Path, tmp_path_factory: pytest.TempPa
     assert {link.name, pipe.name} <= names(shm)
 
 
-def test_a_machine_without_such_a_folder(tmp_path: Path) -> None:
+def test_without_the_folder_nothing_is_freed(tmp_path: Path) -> None:
     """Nothing is freed, and nothing fails."""
     assert orphans(tmp_path / 'none', free=True) == []
 
@@ -110,7 +110,7 @@ def test_a_dead_port_with_a_writer_is_avoided(tmp_path: Path) -> None:
         assert set(avoided) == {replaced, other}, 'those from 7000 on are of all domains'
 
 
-def test_where_one_cannot_look_all_are_avoided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_owners_are_unknown_all_ports_are_avoided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """But so few that Fast DDS finds another one, and those that died last."""
     shm = tmp_path / 'shm'
     shm.mkdir()

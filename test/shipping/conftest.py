@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from shipping.drive import Drive
 from shipping.fakes import FakeSpool, Time, until
+from spool.conftest import moments, root  # noqa: F401 - fixtures of test_thinning.py
+from stores.conftest import bucket, moto, owner, store  # noqa: F401 - fixtures of test_audit.py
 
 
 @pytest.fixture

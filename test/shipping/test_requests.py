@@ -51,7 +51,7 @@ def test_objects_on_request_stay_until_requested(desk: Desk) -> None:
     assert not list((desk.root / 'ready').rglob('*.jpg'))
 
 
-def test_asking_twice_is_asking_once(desk: Desk) -> None:
+def test_a_repeated_request_counts_once(desk: Desk) -> None:
     """The same want has the same id, whoever asks; what was answered stays answered."""
     desk.keeps(frame(1))
     first, second = desk.ask(sensor='camera'), desk.ask(by='other', sensor='camera')
@@ -70,7 +70,7 @@ def test_asking_twice_is_asking_once(desk: Desk) -> None:
     ({'mission': 'patrol'}, [7]), ({'mission_type': 'patrol'}, [7]), ({'patterns': ('thor/camera/*/00000?_*',)}, list(range(8))),
     ({'keys': frozenset({'thor/camera/20251018/000005_front.jpg'})}, [5]),
 ])  # fmt: skip
-def test_a_request_chooses(desk: Desk, want: dict[str, Any], numbers: list[int]) -> None:
+def test_a_request_selects_by_all_its_criteria(desk: Desk, want: dict[str, Any], numbers: list[int]) -> None:
     """All that is given must hold."""
     desk.keeps(*(frame(number, metadata={meta.MISSION_ID: 'patrol_1', meta.MISSION_TYPE: 'patrol'} if number == 7 else
                        {meta.GPS: f'0 {179.999 if number == 1 else -179.999} 0'} if number in {1, 2} else {})
@@ -120,7 +120,7 @@ def test_eviction_starts_with_the_oldest_and_spares_requested_objects(tmp_path: 
         assert_whole(desk.root)
 
 
-def test_protected_alone_beyond_the_limit_ends_keeping(tmp_path: Path) -> None:
+def test_keeping_ends_when_protected_objects_alone_exceed_the_limit(tmp_path: Path) -> None:
     """Nothing protected goes: what is new is not kept, and that is counted."""
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
     with closing(desk.spool):
@@ -131,7 +131,7 @@ def test_protected_alone_beyond_the_limit_ends_keeping(tmp_path: Path) -> None:
         assert_whole(desk.root)
 
 
-def test_what_is_kept_for_too_long_goes(desk: Desk) -> None:
+def test_objects_kept_for_too_long_are_evicted(desk: Desk) -> None:
     """After keep.days, but not what somebody waits for."""
     desk.keeps(frame(1), frame(2))
     desk.clock.now_ns += 15 * 24 * 3600 * SECOND
@@ -141,7 +141,7 @@ def test_what_is_kept_for_too_long_goes(desk: Desk) -> None:
     assert assert_whole(desk.root)['topics']['/camera']['gaps'] == {'evicted': {'keep_days': 1}}
 
 
-def test_requesters_share(desk: Desk) -> None:
+def test_requesters_share_the_link(desk: Desk) -> None:
     """One who asks for much does not keep another one waiting; a more important request has more of the link, not all."""
     size = 100 << 10
     for number in range(0, 300, 30):
@@ -292,7 +292,7 @@ def test_a_request_expires_in_the_middle_of_a_slice_of_many(desk: Desk) -> None:
     assert {row['state'] for row in rows(desk.root) if row['sensor'] == 'camera'} == {'delivered'}
 
 
-def test_a_mailbox_that_changes_at_each_look_asks_once(desk: Desk) -> None:
+def test_a_mailbox_that_keeps_changing_requests_once(desk: Desk) -> None:
     """Whatever changes in an entry but what it asks for, and however often it is there; others are served meanwhile."""
     desk.keeps(*(frame(number) for number in range(4)))
     asked = PullRequest(robot='thor', by='flood', made_ns=desk.clock.now_ns, expires_ns=desk.clock.now_ns + 3600 * SECOND,

@@ -1,18 +1,34 @@
+"""What waits for a rule waits, and nothing else does: with the real spool, however much waits.
+
+Which objects of a real spool leave first.
+
+Threads of delivery that die: what they held is sent again, and the death is counted.
+"""
+
 from __future__ import annotations
 
+import itertools
 import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from faults.campaign import simulated
+from faults.kinds import given_seed
+from faults.report import Summary
+from faults.simulated_day import Day
 from shipping.fakes import FakeSpool, until
 from stores.memory import MemoryStore
 
-from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core import metadata_keys as meta
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import (
     AccessDenied,
     BucketMissing,
@@ -22,8 +38,11 @@ from shadowhound_data_logger.core.errors import (
     StoreError,
     StoreUnavailable,
 )
-from shadowhound_data_logger.core.model import Put, SpooledObject, State
+from shadowhound_data_logger.core.model import EVENTS_WHEN, UPLOAD_WHEN, DataObject, Outcome, Put, SpooledObject, State, waits_for
 from shadowhound_data_logger.shipping.uploader import Uploader
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -144,7 +163,7 @@ def test_rejected_credentials_pause_with_one_log_line_and_resume(
 
 
 @pytest.mark.parametrize('kind', [BucketMissing, AccessDenied])
-def test_a_bucket_that_takes_nothing_waits_alone(spool: FakeSpool, start: Start, kind: type[StoreError]) -> None:
+def test_a_blocked_bucket_delays_no_other(spool: FakeSpool, start: Start, kind: type[StoreError]) -> None:
     """The others are delivered, the status names it, and it recovers."""
     spool.add(100, bucket='closed', priority=0)
     spool.add(100, bucket='open')
@@ -161,7 +180,7 @@ def test_a_bucket_that_takes_nothing_waits_alone(spool: FakeSpool, start: Start,
     assert len(spool.ended_as(State.DELIVERED)) == 200
 
 
-def test_terminal_failures_are_quarantined_with_their_reason_and_few_words(
+def test_terminal_failures_are_quarantined_with_their_reason_and_little_logging(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     """A foreign writer is an error in the log; the second to ninth of a kind are not."""
@@ -208,7 +227,7 @@ def test_a_defect_is_counted_shown_and_survived(spool: FakeSpool, start: Start, 
     assert record.exc_info
 
 
-def test_a_spool_that_cannot_be_asked_is_asked_again(spool: FakeSpool, start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_spool_that_cannot_be_read_is_tried_again(spool: FakeSpool, start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     """A failing query ends no thread."""
     spool.add(5)
     failures = [OSError('disk I/O error')] * 2
@@ -289,7 +308,7 @@ def test_close_before_open_and_twice_is_fine(spool: FakeSpool) -> None:
     assert uploader.status().state == 'not_draining'
 
 
-def test_into_a_folder(spool: FakeSpool, start: Start, tmp_path: Path) -> None:
+def test_objects_are_delivered_into_a_folder(spool: FakeSpool, start: Start, tmp_path: Path) -> None:
     """With the store that is the default: every object is there with its content."""
     items = spool.add(40, content=b'\xff\xd8 a picture')
     store = open_store(StoreSettings(directory=tmp_path / 'store'), SETTINGS)
@@ -298,3 +317,372 @@ def test_into_a_folder(spool: FakeSpool, start: Start, tmp_path: Path) -> None:
     assert {info.key for info in store.list('b')} == {item.key for item in items}
     assert {store.get('b', item.key) for item in items} == {b'\xff\xd8 a picture'}
     store.close()
+
+
+def data_object(number: int, bucket: str = 'sensor-data', priority: int = 5, size: int = 20) -> DataObject:
+    return DataObject(bucket=bucket, key=f'thor/odom/20251018/{number:06d}_odom.json', body=b'%*d' % (size, number),
+                      content_type='application/json', sensor='odom', topic=None, type='t', samples=1, t_start_ns=0,
+                      t_end_ns=0, priority=priority)  # fmt: skip
+
+
+class Draining:
+    """A real spool with an uploader whose outcomes are committed one by one."""
+
+    def __init__(self, root: Path, store: MemoryStore) -> None:
+        self.spool = Spool(root, SpoolSettings(min_free_bytes=0), SystemClock('boot'), 'thor')
+        self.uploader = Uploader(self.spool, store, SETTINGS, self._settle)
+        self.spool.open()
+
+    def _settle(self, outcomes: Sequence[Outcome]) -> None:
+        self.spool.commit((), outcomes)
+        self.uploader.settled([outcome.item.id for outcome in outcomes])
+
+    def close(self) -> None:
+        self.uploader.close(5.0)
+        self.spool.close()
+
+
+@pytest.fixture
+def store() -> MemoryStore:
+    return MemoryStore()
+
+
+@pytest.fixture
+def draining(tmp_path: Path, store: MemoryStore) -> Iterator[Draining]:
+    opened = Draining(tmp_path / 'spool', store)
+    yield opened
+    opened.close()
+
+
+def files(root: Path, folder: str) -> list[str]:
+    return sorted(path.name for path in (root / folder).rglob('*') if path.is_file())
+
+
+def test_delivered_objects_are_removed_from_the_spool(draining: Draining, store: MemoryStore) -> None:
+    """Through an outage in the middle: every object is in the store once, no file is left."""
+    draining.uploader.open()
+    draining.spool.commit([data_object(number) for number in range(60)])
+    draining.uploader.wake()
+    until(lambda: any(True for _ in store.list('sensor-data')))
+    store.fail = lambda _: StoreUnavailable('away')
+    draining.spool.commit([data_object(number) for number in range(60, 120)])
+    draining.uploader.wake()
+    until(lambda: draining.uploader.status().state == 'store_down')
+    store.fail = None
+    until(lambda: draining.spool.pending_count() == 0)
+    assert draining.uploader.drain(10.0)
+    assert len(list(store.list('sensor-data'))) == 120
+    assert files(draining.spool.root, 'ready') == []
+    assert draining.uploader.status().delivered == 120
+
+
+def test_rejected_objects_are_quarantined(draining: Draining, store: MemoryStore) -> None:
+    """Under its reason; the rest is delivered."""
+
+    def fail(item: SpooledObject | None) -> Exception | None:
+        return ObjectRefused('no', reason='KeyTooLongError') if item and item.key.endswith('000003_odom.json') else None
+
+    store.fail = fail
+    draining.spool.commit([data_object(number) for number in range(10)])
+    draining.uploader.open()
+    assert draining.uploader.drain(10.0)
+    assert files(draining.spool.root, 'quarantine/KeyTooLongError/sensor-data') == ['000003_odom.json']
+    assert len(list(store.list('sensor-data'))) == 9
+
+
+def test_buckets_that_are_denied_keep_their_objects(draining: Draining, store: MemoryStore) -> None:
+    """Nothing of them is quarantined, whatever the number of tries; the others go."""
+    store.fail = lambda item: AccessDenied('no') if item and item.bucket == 'trajectories' else None
+    draining.spool.commit([data_object(number, 'trajectories', 0) for number in range(80)])
+    draining.spool.commit([data_object(number) for number in range(80)])
+    draining.uploader.open()
+    until(lambda: draining.spool.pending_count() == 80)
+    until(lambda: draining.uploader.status().retries > 10)
+    assert draining.spool.pending_count() == 80
+    store.fail = None
+    assert not files(draining.spool.root, 'quarantine')
+    until(lambda: draining.spool.pending_count() == 0)
+
+
+def test_two_uploaders_of_one_spool_take_turns(draining: Draining, store: MemoryStore, tmp_path: Path) -> None:
+    """One drains; when it closes, the other one takes over within some seconds, and nothing is sent twice."""
+    draining.uploader.open()
+    until(lambda: draining.uploader.status().state == 'idle')
+    second = Draining(tmp_path / 'spool', store)
+    try:
+        second.uploader.open()
+        second.spool.commit([data_object(1)])
+        until(lambda: draining.spool.pending_count() == 0)
+        assert second.uploader.status().state == 'not_draining'
+        draining.uploader.close(5.0)
+        second.spool.commit([data_object(2)])
+        second.uploader.wake()
+        until(lambda: second.spool.pending_count() == 0)
+        assert second.uploader.status().delivered == 1
+    finally:
+        second.close()
+
+
+@pytest.mark.long('a second of CPU or more')
+def test_a_spool_that_is_full_evicts_while_objects_wait(tmp_path: Path, store: MemoryStore) -> None:
+    """What was evicted is not sent any more and not quarantined; what is left is delivered."""
+    spool = Spool(tmp_path / 'spool', SpoolSettings(max_bytes=1 << 20, min_free_bytes=0), SystemClock('boot'), 'thor')
+    spool.open()
+    uploader: Uploader
+
+    def settle(outcomes: Sequence[Outcome]) -> None:
+        spool.commit((), outcomes)
+        uploader.settled([outcome.item.id for outcome in outcomes])
+
+    uploader = Uploader(spool, store, SETTINGS, settle)
+    store.fail = lambda _: StoreUnavailable('away')
+    uploader.open()
+    try:
+        for number in range(300):
+            spool.commit([data_object(number, size=8192)])
+            uploader.wake()
+        until(lambda: uploader.status().retries > 3)
+        left = spool.pending_count()
+        assert 50 < left < 200
+        store.fail = None
+        until(lambda: spool.pending_count() == 0)
+        assert len(list(store.list('sensor-data'))) == left
+    finally:
+        uploader.close(5.0)
+        spool.close()
+    index = Index(tmp_path / 'spool' / 'index.db', read_only=True)
+    index.open()
+    objects = {state: count for _, state, count, _, _ in index.overview.tally() if count}
+    index.close()
+    assert objects == {'spooled': 300, 'delivered': left, 'evicted': 300 - left}
+
+
+__all__ = ['draining', 'store']
+MANY = 300
+"""More than is looked up at a time, and more important than what may go."""
+
+
+def plain(first: int, count: int) -> list[DataObject]:
+    return [data_object(number, priority=0) for number in range(first, first + count)]
+
+
+def event(number: int) -> DataObject:
+    return replace(data_object(number, 'bags', priority=1), protected=True, sensor='bag', metadata={meta.EVENT: 'fall'})
+
+
+def serve_policy_topics(number: int) -> DataObject:
+    return replace(data_object(number, priority=9), sensor='_catalog')
+
+
+def keys(store: MemoryStore) -> set[str]:
+    return {info.key for bucket in ('sensor-data', 'bags') for info in store.list(bucket)}
+
+
+def spool(draining: Draining, items: Sequence[DataObject]) -> set[str]:
+    draining.spool.commit(items)
+    draining.uploader.wake()
+    return {item.key for item in items}
+
+
+def test_only_objects_under_the_rule_wait(draining: Draining, store: MemoryStore) -> None:
+    """Events and what tells of objects pass a backlog of more important ones; once the rule holds, all of it goes."""
+    draining.uploader.wait_for({UPLOAD_WHEN: 'wifi.ssid == "lab": it is "cafe"'})
+    waiting = spool(draining, plain(0, MANY))
+    free = spool(draining, [event(1000), serve_policy_topics(1001)])
+    draining.uploader.open()
+    until(lambda: keys(store) == free)
+    until(lambda: draining.uploader.status().state == 'waiting')
+    status = draining.uploader.status()
+    assert status.waits_for == {UPLOAD_WHEN: 'wifi.ssid == "lab": it is "cafe"'}
+    assert not draining.uploader.drain(5.0), 'waiting is no use'
+    until(lambda: draining.spool.pending_count() == MANY)
+    free |= spool(draining, [event(1002)])
+    until(lambda: keys(store) == free)
+    draining.uploader.wait_for({})
+    until(lambda: keys(store) == free | waiting)
+    assert draining.uploader.drain(10.0)
+    assert draining.spool.pending_count() == 0
+
+
+def test_events_may_wait_for_a_rule_of_their_own(draining: Draining, store: MemoryStore) -> None:
+    draining.uploader.wait_for({EVENTS_WHEN: 'mission: no mission is active'})
+    events = spool(draining, [event(1), event(2)])
+    others = spool(draining, [*plain(10, 5), serve_policy_topics(20)])
+    draining.uploader.open()
+    until(lambda: keys(store) == others)
+    assert not draining.uploader.drain(5.0)
+    draining.uploader.wait_for({})
+    until(lambda: keys(store) == others | events)
+
+
+def test_objects_already_read_stop_when_the_rule_no_longer_holds(draining: Draining, store: MemoryStore) -> None:
+    """And what failed before waits with it; nothing of that is asked for again and again meanwhile."""
+    store.fail = lambda _: StoreUnavailable('away')
+    draining.uploader.open()
+    waiting = spool(draining, plain(0, 20))
+    until(lambda: draining.uploader.status().deferred >= 1)
+    draining.uploader.wait_for({UPLOAD_WHEN: 'it does not'})
+    until(lambda: draining.uploader.status().in_flight == 0)
+    store.fail = None
+    free = spool(draining, [serve_policy_topics(100)])
+    until(lambda: keys(store) == free)
+    until(lambda: draining.spool.pending_count() == 20)
+    draining.uploader.wait_for({})
+    until(lambda: keys(store) == free | waiting)
+
+
+def test_the_spool_is_drained_when_only_objects_under_the_rule_wait(draining: Draining) -> None:
+    draining.uploader.wait_for({UPLOAD_WHEN: 'it does not'})
+    draining.uploader.open()
+    spool(draining, [serve_policy_topics(1)])
+    until(lambda: draining.spool.pending_count() == 0)
+    assert draining.uploader.drain(10.0)
+
+
+def test_an_object_that_is_protected_later_waits_for_the_same_rule(tmp_path: Path) -> None:
+    """The column that ``protect`` changes has the value that ``waits_for`` gives an object that was protected from the start."""
+    sensors = ('odom', '_catalog', '_', 'camera_previews', '_previews', 'previews', 'x_previewsx')
+    facts: tuple[dict[str, str], ...] = ({}, {meta.EVENT: 'fall'}, {meta.EVENT: ''})
+    index = Index(tmp_path / 'index.db')
+    index.open()
+    with closing(index), index.transaction():
+        for place, (sensor, said) in enumerate(itertools.product(sensors, facts)):
+            item = replace(data_object(place), sensor=sensor, protected=False)
+            index.states.insert(item, item.key, '0' * 64, State.PENDING, None, said, 0)
+            for protected in (False, True):
+                row = index.objects.row(item.bucket, item.key)
+                assert row is not None
+                assert row['waits_for'] == waits_for(sensor, said, protected=protected), (sensor, said, protected)
+                index.states.protect(item.bucket, item.key)
+
+
+@pytest.mark.parametrize('oldest', [False, True])
+def test_waiting_objects_do_not_slow_down_queries(tmp_path: Path, oldest: bool) -> None:
+    """The few that may go are found by an index of their own."""
+    opened = Draining(tmp_path / 'spool', MemoryStore())
+    try:
+        opened.spool.commit([*plain(0, 50), serve_policy_topics(100), event(101)])
+        found = opened.spool.pending(10, oldest=oldest, waiting_for={UPLOAD_WHEN})
+        assert {item.waits_for for item in found} == {'', EVENTS_WHEN}
+        assert [item.waits_for for item in opened.spool.pending(10, oldest=oldest, waiting_for={UPLOAD_WHEN, EVENTS_WHEN})] == [
+            ''
+        ]
+    finally:
+        opened.close()
+
+
+class Ordered(MemoryStore):
+    """Remembers in which order objects came."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.came: list[tuple[int, int]] = []
+        """(priority, number of the object in the spool)."""
+
+    def put(self, item: SpooledObject) -> Put:
+        self.came.append((item.priority, item.id))
+        return super().put(item)
+
+
+@pytest.fixture
+def real_spool(tmp_path: Path) -> Iterator[Spool]:
+    opened = Spool(tmp_path / 'spool', SpoolSettings(min_free_bytes=0), SystemClock('boot'), 'thor')
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def drained(real_spool: Spool) -> list[tuple[int, int]]:
+    """Everything delivered by one thread, in order."""
+    store = Ordered()
+    writer = SpoolWriter(real_spool, 0.05)
+    uploader = Uploader(real_spool, store, UploadSettings(threads=1), writer.settle)
+    writer.on_commit(settled=uploader.settled)
+    writer.open()
+    uploader.open()
+    try:
+        assert uploader.drain(20.0)
+    finally:
+        uploader.close(5.0)
+        writer.close(5.0)
+    return store.came
+
+
+def test_the_most_important_are_sent_first_and_each_fourth_is_the_oldest(real_spool: Spool) -> None:
+    """Over more objects than one look finds, in the order that the index has."""
+    real_spool.commit([data_object(number, priority=8) for number in range(100)])
+    real_spool.commit([data_object(number, priority=number % 3) for number in range(100, 400)])
+    came = drained(real_spool)
+    assert len({number for _, number in came}) == 400
+    important = [entry for place, entry in enumerate(came[:300]) if place % 4 != 3]
+    assert important == sorted((priority, number) for priority, number in came if priority != 8)[: len(important)]
+    assert came[3::4][:100] == [(8, number) for number in range(1, 101)]
+
+
+def test_a_changed_priority_applies_to_new_objects(real_spool: Spool) -> None:
+    """What lies in the spool keeps the one it was spooled with."""
+    real_spool.commit([data_object(1, priority=7), data_object(2, priority=5)])
+    real_spool.commit([data_object(3, priority=1)])
+    assert [priority for priority, _ in drained(real_spool)] == [1, 5, 7]
+
+
+class Deadly(MemoryStore):
+    """Puts of one object raise what is in ``deaths``."""
+
+    def __init__(self, victim: int = 0) -> None:
+        super().__init__()
+        self.victim = victim
+        self.deaths: list[BaseException] = [SystemExit(1), MemoryError()]
+
+    def put(self, item: SpooledObject) -> Put:
+        if item.id == self.victim and self.deaths:
+            raise self.deaths.pop()
+        return super().put(item)
+
+
+def test_a_thread_that_fails_in_a_put_loses_nothing(spool: FakeSpool, start: Callable[[MemoryStore], Uploader]) -> None:
+    """What it held stays pending and is sent again, by the same thread or another; each death is counted."""
+    victim, *rest = spool.add(20)
+    uploader = start(Deadly(victim.id))
+    until(lambda: not spool.items)
+    assert spool.ended_as(State.DELIVERED) == [victim.id, *(item.id for item in rest)]
+    assert sum(worker.failures for worker in uploader.workers) == uploader.status().worker_failures == 2
+
+
+def test_a_drain_lock_that_cannot_be_opened_is_tried_again(spool: FakeSpool, start: Callable[[MemoryStore], Uploader],
+                                               monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """Nothing is sent meanwhile, and it is asked for again."""
+    spool.add(3)
+    failures, lock = [SystemExit(1), OSError('no locks available')], spool.drain_lock
+
+    def failing() -> Any:
+        if failures:
+            raise failures.pop()
+        return lock()
+
+    monkeypatch.setattr(spool, 'drain_lock', failing)
+    uploader = start(MemoryStore())
+    until(lambda: not spool.items)
+    keeper = uploader.workers[0]
+    assert (keeper.name, keeper.failures, keeper.last_error) == ('upload-lock', 2, 'SystemExit: 1')
+
+
+DAYS = 10
+
+
+def check_days(summary: Summary, first: int, days: int) -> None:
+    """Every day went well; else the seeds and the figures are shown."""
+    assert summary.days == days, '\n'.join((f'seeds {first} to {first + days - 1}', *summary.lines()))
+
+
+def test_random_faults_of_simulated_days_lose_nothing() -> None:
+    """With the clock, the pauses and the network simulated, and all else real."""
+    first = given_seed()
+    check_days(simulated(range(first, first + DAYS)), first, DAYS)
+
+
+def test_a_simulated_day_is_the_same_each_time(tmp_path: Path) -> None:
+    """To the last request, so that a seed is a bug report."""
+    first, second = (Day(7, tmp_path / name).run() for name in ('first', 'second'))
+    assert first == second
+    assert first.requests

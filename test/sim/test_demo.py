@@ -97,7 +97,7 @@ def good(scene: Scene) -> Scene:
     return scene
 
 
-def test_an_audit_of_what_is_well_has_no_problems(good: Scene) -> None:
+def test_an_audit_of_a_good_run_has_no_problems(good: Scene) -> None:
     """Objects and samples are counted, messages before the match are told apart, an unlogged topic is not a problem."""
     found = good.audit()
     assert found.problems == ()
@@ -118,7 +118,7 @@ def test_an_object_that_changed_is_found(good: Scene) -> None:
     ]
 
 
-def test_a_delivered_object_that_is_not_there_is_found(scene: Scene) -> None:
+def test_a_missing_delivered_object_is_found(scene: Scene) -> None:
     """What the spool believes delivered and the bucket does not have is named, and its samples are missing."""
     for item in scene.items[1:]:
         scene.deliver(item)
@@ -141,13 +141,13 @@ def test_an_object_without_a_row_is_found(good: Scene) -> None:
     assert good.audit().problems == (f'{twice} has 2 rows in the catalog', f'{late} has 0 rows in the catalog')
 
 
-def test_a_message_after_the_last_one_heard_is_found(good: Scene) -> None:
+def test_a_message_after_the_last_received_one_is_found(good: Scene) -> None:
     """The ledger cannot know of messages that were lost at the very end; the robot's own account does."""
     good.published[IMU] = 5
     assert good.audit().problems == (f'{IMU}: 2 of 5 messages are not in the ledger',)
 
 
-def test_what_is_not_delivered_is_a_problem(scene: Scene) -> None:
+def test_undelivered_objects_are_a_problem(scene: Scene) -> None:
     """Objects that wait in the spool are counted, and so are missed messages."""
     with scene.spool.accounts.entry(IMU) as account:
         account.receive('q', 6)
@@ -177,7 +177,7 @@ def test_the_result_fits_into_80_columns(good: Scene) -> None:
     assert IMU_KEY in text
 
 
-def test_the_result_names_what_is_wrong(good: Scene) -> None:
+def test_the_result_names_the_problems(good: Scene) -> None:
     """A problem is never called well."""
     good.published[IMU] = 5
     text = said(good.audit(), Record(good.published, (READING,), None))
@@ -240,7 +240,7 @@ def test_the_s3_server_stops_once_and_restarts() -> None:
 
 
 @pytest.mark.timeout(60)
-def test_the_s3_server_comes_back_at_the_end_whatever_the_time() -> None:
+def test_the_s3_server_restarts_before_the_end_of_any_demo() -> None:
     """When the robot has stopped the outage is over, so that everything can be delivered."""
     tower = FakeTower()
     with StoreOutage(tower, 1.0, 1000.0) as outage:  # type: ignore[arg-type]
@@ -249,7 +249,7 @@ def test_the_s3_server_comes_back_at_the_end_whatever_the_time() -> None:
     assert tower.calls == ['stop', 'start']
 
 
-def test_nothing_leads_the_demo_to_a_real_robot_or_tower(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_demo_does_not_reach_a_real_robot_or_tower(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Variables of the shell that name a Tower, a robot or peers do not reach the node; the domain is our own."""
     foreign = {'AWS_ENDPOINT_URL': 'http://real', 'AWS_SESSION_TOKEN': 't', 'SHADOWHOUND_ROBOT': 'tachi', 'ROS_DOMAIN_ID': '7',
                'ROS_STATIC_PEERS': '10.0.0.1', 'MLFLOW_TRACKING_URI': 'http://real', 'SHADOWHOUND_HOME': '/real'}  # fmt: skip
@@ -364,7 +364,7 @@ def asked(address: str, path: str) -> bytes:
 @pytest.mark.long('a whole demo')
 @pytest.mark.ros
 @pytest.mark.seaweedfs
-def test_a_short_demo_ends_well(tmp_path: Path) -> None:
+def test_a_short_demo_succeeds(tmp_path: Path) -> None:
     """With a real Tower, the real node, a mission and the simulated robot: exit code 0, a ledger that balances, four pictures.
 
     The page is there while the robot walks, and with --keep afterwards until Ctrl-C; a Chromium takes a fifth picture, of it.

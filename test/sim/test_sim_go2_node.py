@@ -1,4 +1,9 @@
-"""The simulated Go2 as its users meet it: a process that publishes over real DDS."""
+"""The simulated Go2 as its users meet it: a process that publishes over real DDS.
+
+Samples come in order, none left out.
+
+The simulated Go2's parameters, and the loop that publishes what is due.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +13,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import simplejpeg
 from domains import free_domain
-
-pytest.importorskip('rclpy')
-
+from hypothesis import given
+from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
+from shadowhound_sim.sim_go2_node import SimSettings, count, run, schedule
 from sim.listening import (
     BEST_EFFORT,
     COMMON,
@@ -31,7 +37,9 @@ from sim.listening import (
     published,
 )
 
-pytestmark = pytest.mark.ros
+from shadowhound_data_logger.core.errors import SettingError
+
+pytest.importorskip('rclpy')
 
 
 @pytest.fixture(scope='module')
@@ -46,6 +54,7 @@ def finished(domain: int, *parameters: str, **more: str) -> subprocess.Completed
     return subprocess.run(command(*parameters), capture_output=True, text=True, timeout=100, check=False, env=own)
 
 
+@pytest.mark.ros
 @pytest.mark.long('a second of CPU or more')
 def test_it_publishes_exactly_rate_times_duration(some_seconds: Run) -> None:
     """The line of JSON names every topic, resolved, with the exact number, and the exit code is 0."""
@@ -53,6 +62,7 @@ def test_it_publishes_exactly_rate_times_duration(some_seconds: Run) -> None:
     assert some_seconds.published == {f'/tachi/{name}': SECONDS * rate for name, rate in RATES.items()}
 
 
+@pytest.mark.ros
 @pytest.mark.long('a robot at full rate')
 @pytest.mark.parametrize('name', sorted(set(RATES) - BEST_EFFORT))
 def test_reliable_topics_arrive_without_a_gap(some_seconds: Run, name: str) -> None:
@@ -64,14 +74,16 @@ def test_reliable_topics_arrive_without_a_gap(some_seconds: Run, name: str) -> N
         assert numbers == list(range(numbers[0], published + 1))
 
 
+@pytest.mark.ros
 @pytest.mark.parametrize('name', sorted(RATES))
-def test_quality_of_service_is_the_drivers(some_seconds: Run, name: str) -> None:
+def test_the_qos_is_the_drivers(some_seconds: Run, name: str) -> None:
     """BEST_EFFORT where the real driver has it, RELIABLE elsewhere, never latched."""
     profile = some_seconds.endpoints[name].qos_profile
     assert profile.reliability.name == ('BEST_EFFORT' if name in BEST_EFFORT else 'RELIABLE')
     assert profile.durability.name == 'VOLATILE'
 
 
+@pytest.mark.ros
 def test_image_and_jpeg_are_one_frame(some_seconds: Run) -> None:
     """Both have the same stamp, and the JPEG decodes to the image."""
     listener = some_seconds.listener
@@ -93,6 +105,7 @@ def test_image_and_jpeg_are_one_frame(some_seconds: Run) -> None:
         assert np.abs(simplejpeg.decode_jpeg(bytes(jpeg.data), 'BGR').astype(int) - pixels).mean() < 6
 
 
+@pytest.mark.ros
 def test_stamps_are_the_time_of_the_sample_in_utc(some_seconds: Run) -> None:
     """Odometry is stamped every 20 ms, the last 20 ms before the time is over."""
     listener = some_seconds.listener
@@ -102,6 +115,7 @@ def test_stamps_are_the_time_of_the_sample_in_utc(some_seconds: Run) -> None:
     assert 0 < some_seconds.ended_ns - stamps[-1] < 60 * 10**9
 
 
+@pytest.mark.ros
 def test_messages_look_like_the_drivers(some_seconds: Run) -> None:
     """Frames, field layout and joint names are those of go2_ros2_sdk; odometry has no twist, joints only positions."""
     listener = some_seconds.listener
@@ -118,6 +132,7 @@ def test_messages_look_like_the_drivers(some_seconds: Run) -> None:
     assert (info.width, info.height, info.header.frame_id) == (640, 480, 'front_camera')
 
 
+@pytest.mark.ros
 @pytest.mark.skipif('imu' not in RATES, reason='needs go2_interfaces')
 def test_the_go2_messages_belong_together(some_seconds: Run) -> None:
     """The battery is that of the first seconds, motors stand in the robot's order, velocity is walking speed."""
@@ -133,6 +148,7 @@ def test_the_go2_messages_belong_together(some_seconds: Run) -> None:
     assert -2.8 < front_right < -0.8
 
 
+@pytest.mark.ros
 @pytest.mark.parametrize('number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long('a robot of its own'))])
 def test_a_signal_ends_it_with_its_account(number: signal.Signals, domain: int) -> None:
     """SIGINT and SIGTERM both lead to the line of JSON and exit code 0, soon."""
@@ -168,6 +184,7 @@ def _wait_for_publisher(process: subprocess.Popen[str], domain: int) -> bool:
     return False
 
 
+@pytest.mark.ros
 @pytest.mark.long('a robot of its own')
 def test_without_go2_interfaces_it_runs_with_the_rest(tmp_path: Path, domain: int) -> None:
     """The topics of go2_interfaces are missing, all others are there, and one line on stderr says so."""
@@ -180,6 +197,7 @@ def test_without_go2_interfaces_it_runs_with_the_rest(tmp_path: Path, domain: in
     assert sum('go2_interfaces' in line for line in done.stderr.splitlines()) == 1
 
 
+@pytest.mark.ros
 def test_an_unknown_parameter_refuses_the_start(domain: int) -> None:
     """Exit code 2, the parameter's name and the known ones on stderr, nothing on stdout."""
     done = finished(domain, 'duration:=1.0')
@@ -189,6 +207,7 @@ def test_an_unknown_parameter_refuses_the_start(domain: int) -> None:
     assert 'duration_s' in done.stderr
 
 
+@pytest.mark.ros
 @pytest.mark.long('a process of its own')
 def test_a_stray_argument_refuses_the_start(domain: int) -> None:
     """A parameter given without --ros-args is not silently ignored."""
@@ -202,3 +221,85 @@ def test_a_stray_argument_refuses_the_start(domain: int) -> None:
     )
     assert done.returncode == 2
     assert 'seed:=2' in done.stderr
+
+
+@pytest.mark.parametrize(
+    ('rate', 'duration', 'expected'),
+    [(100.0, 60.0, 6000), (30.0, 0.1, 3), (0.1, 30.0, 3), (3.0, 1 / 3, 1), (30.0, 0.11, 4), (10.0, 0.05, 1)],
+)
+def test_the_number_of_samples_is_rate_times_duration(rate: float, duration: float, expected: int) -> None:
+    """A whole product is exactly that many, whatever floating point makes of it; the rest of a period counts as one."""
+    assert count(rate, duration) == expected
+
+
+@given(
+    st.dictionaries(st.sampled_from('abcdef'), st.floats(0.2, 200), min_size=1),
+    st.floats(0.01, 5),
+)
+def test_every_sample_comes_once_and_in_order(rates: dict[str, float], duration: float) -> None:
+    """Times never go back, stay below the duration, and are the multiples of each period."""
+    due = list(schedule(rates, duration))
+    assert all(a[0] <= b[0] for a, b in pairwise(due))
+    for name, rate in rates.items():
+        times = [t for t, of in due if of == name]
+        assert times == [k / rate for k in range(count(rate, duration))]
+
+
+def test_without_a_duration_it_never_ends_and_never_drifts() -> None:
+    """The millionth sample is due exactly where it belongs."""
+    last = list(islice(schedule({'a': 30.0}, 0.0), 300_001))[-1]
+    assert last == (10_000.0, 'a')
+
+
+pytest.importorskip('rclpy')
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [('seed', -1), ('seed', 1.5), ('duration_s', 'long'), ('rate_scale', 0.0), ('rate_scale', float('nan')), ('image_raw', 1)],
+)
+def test_a_wrong_value_is_named(name: str, value: object) -> None:
+    """The error has the name, the value and what is allowed."""
+    with pytest.raises(SettingError) as caught:
+        SimSettings.load({name: value})
+    assert caught.value.data['name'] == name
+    assert str(caught.value).startswith(f'{name} = {value!r} is refused; allowed is')
+
+
+@pytest.mark.ros
+def test_whole_numbers_and_the_parameters_of_rclpy_are_taken() -> None:
+    """``duration_s:=5`` is five seconds, and what rclpy declares by itself is nobody's mistake."""
+    settings = SimSettings.load({'duration_s': 5, 'use_sim_time': False, 'start_type_description_service': True})
+    assert settings == SimSettings(duration_s=5.0)
+
+
+class SlowRobot:
+    """Takes a tenth of a second for its first message, longer than all others should take together."""
+
+    rates_hz = {'a': 1000.0}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.samples: list[tuple[float, int]] = []
+
+    def publish(self, name: str, t: float, stamp_ns: int) -> None:
+        if not self.samples:
+            time.sleep(0.1)
+        self.samples.append((t, stamp_ns))
+
+
+@pytest.mark.ros
+def test_a_late_robot_catches_up_completely() -> None:
+    """After a stall everything that was due is published, each with the time at which it was due."""
+    robot = SlowRobot()
+    run(robot, SimSettings(duration_s=0.05), lambda: False)  # type: ignore[arg-type]
+    assert [t for t, _ in robot.samples] == [k / 1000 for k in range(50)]
+    assert [stamp - robot.samples[0][1] for _, stamp in robot.samples] == [k * 1_000_000 for k in range(50)]
+
+
+@pytest.mark.ros
+def test_a_stop_takes_effect_before_the_next_message() -> None:
+    """Nothing more is published once it is to stop."""
+    robot = SlowRobot()
+    run(robot, SimSettings(), lambda: len(robot.samples) == 3)  # type: ignore[arg-type]
+    assert len(robot.samples) == 3

@@ -131,7 +131,7 @@ def test_a_late_number_of_a_restart_fills_its_hole() -> None:
     assert figures(span) == (3, 2, {'restart': 1})
 
 
-def test_what_a_file_has_of_the_session_before_is_counted_by_its_numbers() -> None:
+def test_messages_of_the_previous_session_are_counted_by_their_numbers() -> None:
     """They come again as repeats; what is missing between them and after them is missed by the restart."""
     span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert span.recover([run(7, 13, 70, 120), run(15, 18, 150, 170)], 5)
@@ -150,7 +150,7 @@ def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> Non
 @pytest.mark.parametrize('runs', [
     [run(1, 6, 101, 150)], [run(12, 17, 120, 160)], [run(10, 13, 500, 520)], [run(10, 16, 101, 150)], [],
 ])  # fmt: skip
-def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[NumberRun]) -> None:
+def test_numbers_that_may_be_of_another_publisher_are_not_used(runs: list[NumberRun]) -> None:
     """Then so many messages are counted, and whatever number comes next is a message as any other."""
     span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert not span.recover(runs, 5)
@@ -159,7 +159,7 @@ def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[Nu
     assert figures(span) == (13, 8, {'transport': 5})
 
 
-def test_a_gap_that_was_counted_already_is_filled_by_what_a_file_has() -> None:
+def test_a_counted_gap_is_filled_by_messages_in_a_file() -> None:
     """Where the next message came before the file was read; what it lacks stays missed, and may still come."""
     span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert taken(span, 20) == [True]
@@ -255,7 +255,7 @@ def test_invalid_sequence_numbers_stop_no_commit(opened: Open, root: Path) -> No
     assert found['topics']['/odom']['received'] == 12 * MAX_PUBLISHERS
 
 
-def test_publishers_that_come_and_go_are_added_up(opened: Open, root: Path) -> None:
+def test_publishers_that_come_and_go_are_summed(opened: Open, root: Path) -> None:
     """Only some have accounts of their own, in memory and in the index; both identities hold exactly, and no gap is lost."""
     spool = opened()
     for number in range(3000):
@@ -278,7 +278,7 @@ def test_publishers_that_come_and_go_are_added_up(opened: Open, root: Path) -> N
         assert db.execute('SELECT published FROM publishers WHERE publisher = ?', (FORMER,)).fetchone()[0] > 10_000
 
 
-def test_one_that_was_added_up_and_is_back(opened: Open, root: Path) -> None:
+def test_a_summed_publisher_that_returns_is_counted_again(opened: Open, root: Path) -> None:
     """What it published meanwhile is missed, what it sends again is a repeat; in the next session it is where it was."""
     spool = opened()
     receive(spool, 10, '/odom', 'robot')
@@ -305,7 +305,7 @@ def test_one_that_was_added_up_and_is_back(opened: Open, root: Path) -> None:
     assert found['topics']['/odom']['missed_by'] == {'transport': 2}
 
 
-def test_what_was_added_up_and_not_committed_is_tried_again() -> None:
+def test_uncommitted_sums_are_tried_again() -> None:
     """Rows that a failed commit should have removed are removed by the next one."""
     accounts = Accounts()
     with accounts.entry('/odom') as account:
@@ -365,7 +365,7 @@ def test_before_the_first_message_nothing_is_known() -> None:
     assert (TopicAccount().missed, TopicAccount().missed_estimated) == (None, None)
 
 
-def test_two_publishers_have_numbers_of_their_own() -> None:
+def test_two_publishers_have_separate_numbers() -> None:
     """The same number of two publishers is two messages."""
     account = TopicAccount()
     assert [account.receive('a', 1), account.receive('b', 1), account.receive('b', 1)] == [True, True, False]
@@ -437,7 +437,7 @@ def test_messages_of_another_type_are_received_and_rejected(opened: Open, root: 
     }  # fmt: skip
 
 
-def test_other_types_are_few() -> None:
+def test_the_number_of_other_types_is_limited() -> None:
     """Whoever invents types fills no memory: beyond some they are one, of which nothing is counted."""
     accounts = Accounts()
     for number in range(1000):
@@ -450,7 +450,7 @@ def test_other_types_are_few() -> None:
     assert len(found['b/msg/B1'].publishers) == len(found[MORE_TYPES].publishers) == MAX_NODES
 
 
-def test_without_a_named_type_losses_are_unknown() -> None:
+def test_without_a_configured_type_losses_are_unknown() -> None:
     """Where another type is published and not counted, what was missed of the topic is unknown, and not 0."""
     accounts = Accounts()
     with accounts.entry('/odom') as account:

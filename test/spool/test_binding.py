@@ -59,7 +59,7 @@ def test_a_bound_object_is_pending_under_its_final_name(spool: Spool, root: Path
     assert assert_whole(root)['objects']['pending'] == 1
 
 
-def test_what_is_bound_counts_as_before(spool: Spool, root: Path) -> None:
+def test_a_bound_object_counts_as_before(spool: Spool, root: Path) -> None:
     """The ledger closes in between, and the samples of a bound object are delivered in the end."""
     bindings = hold(spool, 'a', 'b', 'c')
     items = spool.bind(bindings[:2])
@@ -88,7 +88,7 @@ def test_final_names_are_unique(spool: Spool) -> None:
     assert [item.key for item in spool.bind([one, same, stays])] == ['thor/final/a_1', 'thor/final/a_2', 'thor/provisional/c']
 
 
-def test_a_name_that_was_given_out_often_is_found_in_few_questions(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_number_for_a_frequent_name_is_found_in_few_queries(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     """In turn, without a gap: an agent that numbers none of its frames must not keep the index from others."""
     asked: list[str] = []
     row = ObjectTable.row
@@ -163,7 +163,7 @@ def test_waiting_time_starts_once_the_clock_is_set(spool: Spool, root: Path, clo
 
 @pytest.mark.parametrize(('moment', 'state'), [('renamed', 'held'), ('synced', 'held'), ('bound', 'pending')])
 @pytest.mark.parametrize('index', ['kept', 'lost'])
-def test_killed_between_two_steps(opened: Open, root: Path, moment: str, state: str, index: str) -> None:
+def test_a_binding_killed_between_two_steps_is_completed(opened: Open, root: Path, moment: str, state: str, index: str) -> None:
     """Until it is committed all are held, from then on all are bound: rows, files and descriptions agree after the next start."""
     with started('bind', root, moment) as child:
         assert child.wait(60) == -9
@@ -186,7 +186,7 @@ def test_killed_between_two_steps(opened: Open, root: Path, moment: str, state: 
 
 
 @pytest.mark.long('a death after each step')
-def test_death_at_any_moment_of_a_binding(root: Path, moments: Moments) -> None:
+def test_a_kill_at_any_moment_of_a_binding_loses_nothing(root: Path, moments: Moments) -> None:
     """Objects are bound all or none; what is left can be bound and delivered, and the ledger closes."""
     spool = new_spool(root)
     spool.open()
@@ -255,7 +255,7 @@ def test_an_interrupted_binding_is_completed(opened: Open, root: Path) -> None:
     assert_whole(root)
 
 
-def test_what_is_held_is_found_without_looking_at_the_rest(spool: Spool) -> None:
+def test_held_objects_are_found_without_reading_the_rest(spool: Spool) -> None:
     """A hundred thousand delivered objects cost it nothing."""
     asked: list[str] = []
     spool._connections.reading._db.set_trace_callback(asked.append)

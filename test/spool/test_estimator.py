@@ -106,14 +106,14 @@ def test_a_block_of_loss_is_known_to_5_percent(stream: tuple[int, float, bool, i
 
 @settings(max_examples=examples(30), deadline=None)
 @given(STREAMS)
-def test_what_is_not_lost_is_not_called_lost(stream: tuple[int, float, bool, int, int, int, float]) -> None:
+def test_nothing_is_called_lost_without_a_loss(stream: tuple[int, float, bool, int, int, int, float]) -> None:
     """Jitter alone makes no loss: under one in a hundred, of loops that drift; none of a timer to speak of."""
     period, jitter, is_loop, seed, *_ = stream
     ear = Ear().hear(loop(2000, period, jitter, seed) if is_loop else even(2000, period, 0.0, jitter, seed))
     assert ear.lost <= (20 if is_loop else 5)
 
 
-def test_what_was_lost_before_the_rhythm_was_known_is_counted() -> None:
+def test_losses_before_the_rhythm_was_known_are_counted() -> None:
     """Nothing is known for 200 intervals, and then all of it."""
     ear = Ear().hear(without(even(LEARN + 20), (50, 90))[: LEARN - 10])
     assert (ear.covered, ear.lost) == (0, 0)
@@ -137,14 +137,14 @@ def test_a_publisher_that_is_starved_and_catches_up_loses_nothing() -> None:
     assert ear.lost <= 1
 
 
-def test_a_stalled_node() -> None:
+def test_messages_overwritten_during_a_stall_are_lost_by_transport() -> None:
     """What a full history overwrote meanwhile is lost by transport: nobody asked for it."""
     sent = even(1000)
     ear = Ear().hear(sent[:500]).hear(without(sent[500:], (10, 140)), asleep_s=3.0)
     assert ear.missed == {TRANSPORT: 130}
 
 
-def test_what_the_network_held_for_a_node_that_stood_still() -> None:
+def test_messages_delayed_during_a_stall_are_not_a_clock_step() -> None:
     """It comes in several drains. The gap may be longer than the time between these, and is not a step of a clock."""
     sent = even(1000)
     ear = Ear().hear(sent[:500])
@@ -177,14 +177,14 @@ def test_another_rate_is_no_loss(factor: float) -> None:
 
 
 @pytest.mark.parametrize(('size', 'inner_ms', 'outer_ms'), [(4, 1, 50), (5, 1, 50), (5, 1, 2), (10, 0.2, 100), (100, 1, 1000)])
-def test_what_comes_in_groups_has_no_rhythm(size: int, inner_ms: float, outer_ms: float) -> None:
+def test_messages_in_groups_have_no_rhythm(size: int, inner_ms: float, outer_ms: float) -> None:
     """The pauses between them are nobody's loss."""
     places = [group * (size * inner_ms + outer_ms) + each * inner_ms for group in range(3000 // size) for each in range(size)]
     ear = Ear().hear(int(place * MS) for place in places)
     assert (ear.covered, ear.lost) == (0, 0)
 
 
-def test_what_comes_by_chance_has_no_rhythm() -> None:
+def test_random_messages_have_no_rhythm() -> None:
     """Intervals of no length in particular."""
     chance = random.Random(3)
     ear = Ear().hear(int(stamp) for stamp in accumulate(chance.expovariate(1 / PERIOD) for _ in range(3000)))
@@ -203,7 +203,7 @@ def test_two_publishers_have_no_rhythm(phase: float) -> None:
     assert ear.lost <= 5
 
 
-def test_two_that_alternate_evenly_are_not_taken_for_one() -> None:
+def test_two_alternating_publishers_are_not_mistaken_for_one() -> None:
     """They look like one of twice the rate; the graph says that they are two."""
     ear = Ear().hear(even(2000), is_only=False)
     assert (ear.covered, ear.lost) == (0, 0)
@@ -219,7 +219,7 @@ def test_a_step_of_a_clock_is_no_loss(step_s: int) -> None:
 
 
 @pytest.mark.parametrize('drift', [-0.0005, 0.0005])
-def test_a_clock_that_drifts(drift: float) -> None:
+def test_a_drifting_clock_is_followed(drift: float) -> None:
     """A step is still told from loss after hours, in which the clocks have gone apart by more than that."""
     estimator = LossEstimator(Expectation(period=10 * SECOND))
     for second in range(0, 15_000, 10):
@@ -244,14 +244,14 @@ def test_overtaken_messages_fill_their_gap() -> None:
     assert missed.total() == 0
 
 
-def test_a_declared_rate_sees_loss_that_is_even() -> None:
+def test_a_declared_rate_detects_even_loss() -> None:
     """Which nothing else can: three of four messages are lost from the start."""
     sent = even(2000)
     assert Ear().hear(sent[::4]).lost == 0
     assert Ear(LossEstimator(Expectation(period=PERIOD))).hear(sent[::4]).lost == 1497
 
 
-def test_a_declared_rate_that_is_wrong() -> None:
+def test_a_wrong_declared_rate_is_detected() -> None:
     """When messages come more often it is not believed any more."""
     ear = Ear(LossEstimator(Expectation(period=2.5 * PERIOD))).hear(even(1000))
     assert ear.estimator.refuted
@@ -274,7 +274,7 @@ def test_a_counter_counts_exactly(first: int, step: int, wrap: int, start: int, 
         assert missed.total() == length
 
 
-def test_a_counter_that_stays_zero() -> None:
+def test_a_counter_that_stays_zero_is_not_used() -> None:
     """It says nothing, and nothing is claimed."""
     estimator = LossEstimator(Expectation('counter:tick', 0.0, 1 << 32))
     assert sum(estimator.observe([0] * 10, ArrivalContext()).covered for _ in range(100)) == 0
@@ -296,7 +296,7 @@ def test_a_gap_before_another_publisher_is_no_loss() -> None:
     assert ear.missed == {TRANSPORT: 30}
 
 
-def test_one_of_a_crowd_is_not_counted() -> None:
+def test_one_of_many_publishers_is_not_counted() -> None:
     """While several publish, and nobody knows who, nothing is claimed; with the last one the rhythm goes on."""
     estimate = TopicEstimate()
     sent = even(1000, jitter=0.0)
@@ -330,6 +330,6 @@ def test_the_next_session_continues() -> None:
 
 
 @given(st.lists(st.integers(-(10**9), 10**9), min_size=2, max_size=300))
-def test_no_intervals_are_too_odd(intervals: list[int]) -> None:
+def test_any_intervals_are_accepted(intervals: list[int]) -> None:
     """Whatever they are, there is a period or none."""
     assert learn_period(intervals) >= 0.0

@@ -137,7 +137,7 @@ def test_the_watermark_is_before_open_batches(spool: Spool) -> None:
     assert watermark.complete_ns == NOON_NS + 200 * MS
 
 
-def test_a_publisher_that_was_heard_lately_holds_the_watermark(spool: Spool) -> None:
+def test_a_recently_received_publisher_holds_the_watermark(spool: Spool) -> None:
     """What it sent since may be found to be missed; after a minute nobody waits for it."""
     hear(spool, 10, publisher='slow')
     for number, ends_s in ((100, 1), (580, 1), (700, 70)):
@@ -180,7 +180,7 @@ def test_a_stamp_of_the_future_is_the_time_of_no_loss() -> None:
     assert found.add('missed', 'transport', 2, by_arrival(-5), by_arrival(NOON_NS)).begin_ns == NOON_NS
 
 
-def test_a_loss_is_not_timed_by_two_clocks() -> None:
+def test_a_loss_is_timed_by_one_clock() -> None:
     """One publisher with UTC and one with a clock that was never set: no gap is from the one to the other."""
     found = TopicGaps(clock=FakeClock(now_ns=50 * SECOND))
     key = found.add('missed', 'transport', 2, by_arrival(NOON_NS), by_arrival(40 * SECOND))
@@ -231,7 +231,7 @@ def test_a_loss_of_unknown_publishers_is_not_from_one_clock_to_the_other() -> No
     assert {(row.received_from_ns, row.received_to_ns) for row in rows} == {(NOON_NS, NOON_NS + 2 * SECOND)}
 
 
-def test_a_clock_that_is_set_back_takes_the_watermark_along(spool: Spool) -> None:
+def test_the_watermark_follows_a_clock_that_is_set_back(spool: Spool) -> None:
     """What was complete by the wrong clock says nothing of the same time by the right one."""
     hear(spool, 100)
     deliver(spool, *spool.commit([make('a')]))
@@ -280,7 +280,7 @@ def test_the_watermark_waits_for_publishers_of_the_session_before(root: Path, op
     assert [mark.session for mark in spool.gaps_after(0, 10, {})[1]] == [1, 2]
 
 
-def test_a_batch_that_overtook_another_claims_nothing_for_it(root: Path, opened: Open) -> None:
+def test_a_batch_does_not_advance_the_watermark_past_an_earlier_one(root: Path, opened: Open) -> None:
     """Two encoders: the later batch is durable, a death takes the earlier one; its time is not known to be complete."""
     spool = new_spool(root)
     spool.open()
@@ -309,7 +309,7 @@ def test_a_retried_commit_claims_no_later_messages(spool: Spool, monkeypatch: py
     assert watermark(spool) == (0.1, 0.1)
 
 
-def test_what_waits_while_a_full_disk_empties_is_not_settled(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_objects_waiting_for_a_full_disk_are_not_settled(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Outcomes are committed first, without the objects that have no room yet."""
     spool.accounts.oldest_open = dict
     hear(spool, 1)
@@ -328,7 +328,7 @@ def test_what_waits_while_a_full_disk_empties_is_not_settled(spool: Spool, monke
     assert told == [(0.1, 0.1)]
 
 
-def test_what_a_death_cost(root: Path, opened: Open) -> None:
+def test_the_losses_of_a_kill_are_listed(root: Path, opened: Open) -> None:
     """Open batches: dropped, between what was durable and what was heard; what nobody heard: missed, until it was."""
     spool = new_spool(root)
     spool.open()
@@ -344,7 +344,7 @@ def test_what_a_death_cost(root: Path, opened: Open) -> None:
     assert short(root) == [('dropped', 'restart', 3, 1.0, 1.3), ('missed', 'restart', 6, 1.3, 2.0)]
 
 
-def test_what_is_estimated_to_be_lost_with_a_restart_has_its_time(root: Path) -> None:
+def test_estimated_losses_of_a_restart_have_times(root: Path) -> None:
     """From the newest message of the session before; where numbers tell, but not who sent the last one when, as well."""
     spool = new_spool(root)
     spool.open()
@@ -401,7 +401,7 @@ def test_an_object_without_room_is_in_the_journal(root: Path) -> None:
     assert ledger.read(root, 'thor')['balanced']
 
 
-def test_what_is_forgotten_stays_in_the_sums(root: Path) -> None:
+def test_forgotten_gaps_stay_in_the_sums(root: Path) -> None:
     """Rows go with the keys that are remembered no longer, and the ledger still closes."""
     clock = FakeClock()
     spool = new_spool(root, clock)
@@ -423,7 +423,7 @@ def test_what_is_forgotten_stays_in_the_sums(root: Path) -> None:
 
 
 @pytest.mark.parametrize('counts', [{}, {CAMERA: 1}], ids=['of one topic', 'of several'])
-def test_an_old_object_that_was_evicted_on_its_way_and_arrived_is_no_loss(root: Path, counts: dict[str, int]) -> None:
+def test_an_object_evicted_during_its_upload_that_arrived_is_not_a_loss(root: Path, counts: dict[str, int]) -> None:
     """Its row is forgotten early, since its messages are that old; the sum is put right all the same."""
     clock = FakeClock()
     spool = new_spool(root, clock)
@@ -510,7 +510,7 @@ def test_a_gap_is_kept_until_it_is_reported(root: Path) -> None:
     spool.close()
 
 
-def test_rows_of_no_known_time_go_with_their_session(root: Path) -> None:
+def test_rows_without_a_time_are_removed_with_their_session(root: Path) -> None:
     """Of before the clock was set, of no time and of a time to come: they cannot be told by their age."""
     clock = FakeClock(now_ns=500 * SECOND)
     spool = new_spool(root, clock)
@@ -535,7 +535,7 @@ def test_rows_of_no_known_time_go_with_their_session(root: Path) -> None:
     spool.close()
 
 
-def test_there_are_never_more_rows_than_that(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_rows_is_limited(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
     """Told or not, and where no clock is ever set: those that did not change for the longest become a sum."""
     monkeypatch.setattr(gap_table, 'MAX_ROWS', 10)
     clock.now_ns = 500 * SECOND
@@ -563,7 +563,7 @@ def test_before_the_clock_is_set_losses_have_times_since_boot() -> None:
     assert key.begin_ns == 3 * SECOND
 
 
-def test_a_commit_that_fails_loses_no_time(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_commit_keeps_the_times(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next one has what it had, once."""
     hear(spool, 1, 3)
     spool.commit()

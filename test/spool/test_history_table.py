@@ -59,7 +59,7 @@ def used(root: Path) -> tuple[int, int]:
     return (count - free) * size, count * size
 
 
-def test_pages_are_used_again(spool: Spool, root: Path) -> None:
+def test_free_pages_are_reused(spool: Spool, root: Path) -> None:
     """The file does not grow once as much is forgotten as comes."""
     sizes = []
     for day in range(10):
@@ -69,7 +69,7 @@ def test_pages_are_used_again(spool: Spool, root: Path) -> None:
     assert max(sizes[-3:]) <= 1.02 * max(sizes[3:7])
 
 
-def test_what_a_key_needs_stays_known(opened: Open, spool: Spool, root: Path) -> None:
+def test_keys_stay_known_as_long_as_they_are_needed(opened: Open, spool: Spool, root: Path) -> None:
     """That it was used, with which content; what became of it; and the ledger."""
     leave(spool, frame(1), make('thor/rosbags/bag_a/bag_a_0.mcap', b'a slice'))
     leave(spool, make('thor/rosbags/bag_a/bag_a_1.mcap', b'another'), state=State.EVICTED)
@@ -108,7 +108,7 @@ def test_an_audit_checks_each_delivery_once(spool: Spool, root: Path) -> None:
         assert {info.sha256 for info in asked} == {content_sha256(frame(second).body) for second in range(9)}
 
 
-def test_what_the_catalog_lacks_keeps_its_row(spool: Spool, root: Path) -> None:
+def test_uncataloged_objects_keep_their_rows(spool: Spool, root: Path) -> None:
     """Its metadata are what a part of the catalog is made of."""
     (item,) = put(spool, frame(1))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
@@ -119,7 +119,7 @@ def test_what_the_catalog_lacks_keeps_its_row(spool: Spool, root: Path) -> None:
     assert rows(root) == []
 
 
-def test_what_a_full_disk_never_took_in_is_forgotten_too(root: Path) -> None:
+def test_objects_refused_by_a_full_disk_are_forgotten_too(root: Path) -> None:
     """It has the time at which it came."""
     clock = FakeClock()
     spool = new_spool(root, clock, max_bytes=1)

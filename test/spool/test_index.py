@@ -55,7 +55,7 @@ def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_a_look_costs_the_same_whatever_the_backlog(index: Index) -> None:
+def test_a_query_costs_the_same_whatever_the_backlog(index: Index) -> None:
     """In both orders, also while the bucket of the backlog takes nothing."""
     add(index, range(20), 'b')
     add(index, range(FEW), 'a')

@@ -28,7 +28,7 @@ def run_sql(root: Path, *statements: str) -> None:
     connection.close()
 
 
-def test_a_complete_ledger(spool: Spool, root: Path) -> None:
+def test_the_ledger_has_every_account(spool: Spool, root: Path) -> None:
     """Every figure of the ledger's contract, from one session of two topics."""
     with spool.accounts.entry('/camera') as account:
         account.type = 'sensor_msgs/msg/CompressedImage'
@@ -105,7 +105,7 @@ def test_sessions_add_up(opened: Open, root: Path) -> None:
     }  # fmt: skip
 
 
-def test_it_is_read_while_the_node_runs(root: Path) -> None:
+def test_the_ledger_is_read_while_the_node_runs(root: Path) -> None:
     """Every ledger read while another process writes is of one instant and closes."""
     with started('load', root) as child:
         assert child.stdout is not None
@@ -118,13 +118,13 @@ def test_it_is_read_while_the_node_runs(root: Path) -> None:
     assert len(seen) > 20
 
 
-def test_an_empty_spool(spool: Spool, root: Path) -> None:
+def test_the_ledger_of_an_empty_spool_balances(spool: Spool, root: Path) -> None:
     """A spool in which nothing happened has a ledger that closes."""
     found = assert_whole(root)
     assert (found['topics'], found['objects']['spooled']) == ({}, 0)
 
 
-def test_there_is_no_spool(tmp_path: Path) -> None:
+def test_a_missing_spool_is_an_error(tmp_path: Path) -> None:
     """Without a spool the error names the folder, and none is made."""
     with pytest.raises(SpoolError, match=r'no spool in .*elsewhere.*SHADOWHOUND_HOME'):
         ledger.read(tmp_path / 'elsewhere', 'thor')
@@ -132,7 +132,7 @@ def test_there_is_no_spool(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('content', [b'', b'garbage' * 1000, None])
-def test_an_index_that_cannot_be_read(opened: Open, root: Path, content: bytes | None) -> None:
+def test_an_unreadable_index_is_an_error(opened: Open, root: Path, content: bytes | None) -> None:
     """A damaged index, or one whose values are none, is an error with a remedy."""
     spool = opened()
     put(spool, make())

@@ -11,7 +11,7 @@ from shadowhound_data_logger.spool import operator_requests
 from shadowhound_data_logger.spool.operator_requests import MAX_BYTES, MAX_REQUESTS, MAX_TEXT, OperatorRequests
 
 
-def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
+def test_the_newest_requests_survive_the_process(tmp_path: Path) -> None:
     """So many of them, in their order, each with who, what, when and the answer; of another robot none."""
     now_ns = count(1).__next__
     record = OperatorRequests(tmp_path, 'thor', now_ns)

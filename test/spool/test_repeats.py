@@ -21,7 +21,7 @@ def picture(second: int, body: bytes = b'the same', **fields: object) -> DataObj
     return make(f'thor/camera/20251018/1200{second:02d}_front.jpg', body, **given)
 
 
-def test_the_same_picture_is_stored_once(spool: Spool, root: Path) -> None:
+def test_the_same_image_is_stored_once(spool: Spool, root: Path) -> None:
     """In one commit or in several; each is in the ledger, and names the key that holds it."""
     put(spool, picture(0), picture(1))
     assert put(spool, picture(2)) == []
@@ -46,7 +46,7 @@ def test_the_next_image_reports_the_repeats(spool: Spool) -> None:
     assert not any(name.startswith('repeats') for name in item.metadata)
 
 
-def test_only_what_follows_itself_is_a_repeat(spool: Spool) -> None:
+def test_only_consecutive_equal_content_is_a_repeat(spool: Spool) -> None:
     """A picture that comes back later, that of another sensor, topic or bucket, and any without the setting are stored."""
     put(spool, picture(0))
     assert len(put(spool, picture(1, b'another'), picture(2))) == 2
@@ -69,14 +69,14 @@ def test_delivered_content_counts_and_lost_content_does_not(opened: Open, root: 
     assert_whole(root)
 
 
-def test_what_has_no_date_yet_is_no_repeat(spool: Spool) -> None:
+def test_an_object_without_a_date_is_not_a_repeat(spool: Spool) -> None:
     """Its key is a provisional one, so nothing can name it."""
     put(spool, picture(0, held='clock'), picture(1, held='clock'))
     assert len(spool.reading.objects.held('clock')) == 2
     assert len(put(spool, picture(2))) == 1
 
 
-def test_a_commit_that_fails_is_no_content(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_commit_does_not_count_as_stored_content(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tried again, the same objects come to the same end."""
     receive(spool, 3)
     group = [picture(0), picture(1), picture(2, b'new')]
@@ -90,7 +90,7 @@ def test_a_commit_that_fails_is_no_content(spool: Spool, root: Path, monkeypatch
     assert_whole(root)
 
 
-def test_what_has_repeats_is_never_evicted(opened: Open, root: Path) -> None:
+def test_an_object_with_repeats_is_never_evicted(opened: Open, root: Path) -> None:
     """An outage that fills the spool costs what stands for itself alone."""
     spool = opened(max_bytes=100_000)
     put(spool, picture(0, bytes(20_000)), picture(1, bytes(20_000)))

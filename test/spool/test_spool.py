@@ -1,8 +1,12 @@
+"""A commit that hangs in the disk: what waits is still told, and the end is reached all the same."""
+
 from __future__ import annotations
 
 import json
 import os
 import stat
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,6 +33,8 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.keys import MAX_SEGMENT_BYTES
 from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.spool import spool as spool_module
+from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 from shadowhound_data_logger.spool.topic_account import BAG
 
@@ -54,7 +60,7 @@ def test_an_empty_commit_changes_nothing(spool: Spool, root: Path) -> None:
     assert rows(root) == []
 
 
-def test_pending_gives_what_commit_gave(spool: Spool) -> None:
+def test_pending_returns_the_committed_objects(spool: Spool) -> None:
     """An object read back from the index equals the one that commit returned."""
     items = put(spool, make(metadata={'robot': 'thor'}), make('thor/b', b''))
     assert spool.pending(5) == items
@@ -143,7 +149,7 @@ def test_held_objects_wait(spool: Spool, root: Path) -> None:
     assert assert_whole(root)['objects']['held'] == 1
 
 
-def test_pending_order(spool: Spool) -> None:
+def test_pending_objects_are_ordered_by_priority_or_age(spool: Spool) -> None:
     """The most important first, then the oldest; or the oldest first."""
     put(spool, make('a', priority=5), make('b', priority=1), make('c', priority=5), make('d', priority=0))
     assert [item.key for item in spool.pending(9)] == ['d', 'b', 'a', 'c']
@@ -182,7 +188,7 @@ def test_old_deliveries_are_forgotten_and_totals_stay(spool: Spool, root: Path, 
     assert assert_whole(root) == before
 
 
-def test_forgetting_keeps_up(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forgetting_keeps_up_with_deliveries(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
     """While more than one step is to be forgotten, each commit forgets one, not one an hour."""
     monkeypatch.setattr('shadowhound_data_logger.spool.history_table.FORGET_STEP', 2)
     items = put(spool, *(make(str(number)) for number in range(5)))
@@ -257,7 +263,7 @@ def test_one_process_drains(opened: Open) -> None:
         assert again
 
 
-def test_the_drain_lock_dies_with_its_process(spool: Spool, root: Path) -> None:
+def test_the_drain_lock_ends_with_its_process(spool: Spool, root: Path) -> None:
     """Another process's drain lock is respected, and free once that process was killed."""
     with started('hold', root) as child:
         assert child.stdout is not None
@@ -299,14 +305,14 @@ def test_another_process_reads_what_was_added(opened: Open) -> None:
     assert found == item
 
 
-def test_a_folder_that_cannot_be_used(tmp_path: Path) -> None:
+def test_an_unusable_folder_is_an_error(tmp_path: Path) -> None:
     """A spool where a file lies is refused with its name and a remedy."""
     (tmp_path / 'spool').write_text('a file')
     with pytest.raises(SpoolError, match=r'spool cannot be used: .*SHADOWHOUND_HOME'):
         new_spool(tmp_path / 'spool').open()
 
 
-def test_a_barred_place_stops_nothing(spool: Spool, root: Path) -> None:
+def test_an_unreadable_folder_stops_nothing(spool: Spool, root: Path) -> None:
     """An object whose folder cannot be made is committed, shipped from where it is, and counted once."""
     put(spool, make('thor/a'))
     (item,) = put(spool, make('thor/a/b', b'below'))
@@ -317,7 +323,38 @@ def test_a_barred_place_stops_nothing(spool: Spool, root: Path) -> None:
     assert_whole(root)
 
 
-def test_a_spool_that_was_not_opened() -> None:
+def test_a_spool_that_was_not_opened_refuses_calls() -> None:
     """Using a spool before it is open says so."""
     with pytest.raises(SpoolError, match='not open'):
         new_spool(Path('nowhere')).pending(1)
+
+
+@pytest.fixture
+def hanging(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spool]:
+    """One object waits, and the sync of a second one does not return before the test is over."""
+    put(spool, make('thor/first.jpg'))
+    entered, let_go = threading.Event(), threading.Event()
+
+    def sync(_: Tree) -> None:
+        entered.set()
+        assert let_go.wait(60)
+
+    monkeypatch.setattr(Tree, 'sync_incoming', sync)
+    thread = threading.Thread(target=put, args=(spool, make('thor/second.jpg')))
+    thread.start()
+    assert entered.wait(60)
+    yield spool
+    let_go.set()
+    thread.join(60)
+
+
+def test_pending_objects_are_listed_during_a_hung_commit(hanging: Spool) -> None:
+    """The line in the log that says so must not hang, too."""
+    assert hanging.pending_count() == 1
+
+
+def test_closing_does_not_wait_for_a_hung_commit(hanging: Spool, monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
+    """It says which disk it is, and can be repeated when that answers."""
+    monkeypatch.setattr(spool_module, 'CLOSE_S', 0.01)
+    with pytest.raises(SpoolError, match=f'{root} cannot be closed: its disk does not answer'):
+        hanging.close()

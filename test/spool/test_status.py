@@ -45,7 +45,7 @@ def state(root: Path, now_ns: int = NOON_NS) -> str:
     return read(root, 'thor', FakeClock(now_ns)).state
 
 
-def test_a_fresh_status_is_that_of_a_running_node(tmp_path: Path) -> None:
+def test_a_fresh_status_means_a_running_node(tmp_path: Path) -> None:
     """Younger than five seconds by the boot clock, whatever the wall clock says; its figures are handed on as they are."""
     written(tmp_path, topics={'/imu': {'received': 7}}, time='1970-01-01T00:00:00Z')
     found = read(tmp_path, 'thor', FakeClock(NOON_NS + 4 * SECOND))
@@ -57,7 +57,7 @@ def test_a_fresh_status_is_that_of_a_running_node(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     'changes', [{'boot_id': 'another'}, {'ended': True}, {'pid': 2**22 + 1, 'boot_ns': NOON_NS - 6 * SECOND}]
 )
-def test_the_status_of_a_node_that_exited(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_an_exited_node_is_not_running(tmp_path: Path, changes: dict[str, Any]) -> None:
     """Of another boot, of a clean end, or old and of a process that is gone: not running, and its figures are not shown."""
     written(tmp_path, topics={'/imu': {}}, **changes)
     found = read(tmp_path, 'thor', FakeClock())
@@ -66,7 +66,7 @@ def test_the_status_of_a_node_that_exited(tmp_path: Path, changes: dict[str, Any
     assert 'the node is not running' in found.findings
 
 
-def test_a_process_that_is_silent_is_not_answering(tmp_path: Path, child: int) -> None:
+def test_a_silent_process_is_not_answering(tmp_path: Path, child: int) -> None:
     """It was there when the status was written and still is, but wrote nothing for five seconds."""
     clock = SystemClock.of_this_machine()
     written(tmp_path, pid=child, boot_id=clock.boot_id, boot_ns=clock.boot_ns())
@@ -123,7 +123,7 @@ def test_fields_of_a_newer_node_are_ignored(tmp_path: Path) -> None:
     assert (found.store.delivered, found.topics['/imu'].received) == (5, 7)
 
 
-def test_figures_that_another_version_does_not_write_have_defaults(tmp_path: Path) -> None:
+def test_fields_of_other_versions_have_defaults(tmp_path: Path) -> None:
     """A program that is newer than the node that runs can still show its status."""
     written(tmp_path, topics={'/imu': {}}, workers={'intake': {}})
     found = read(tmp_path, 'thor', FakeClock())
@@ -153,7 +153,7 @@ def test_without_a_node_the_index_is_read(tmp_path: Path) -> None:
     assert pile.free_bytes
 
 
-def test_a_session_that_was_cut_off_has_no_end(tmp_path: Path) -> None:
+def test_a_killed_session_has_no_end(tmp_path: Path) -> None:
     """A node that was killed leaves a session without an end, and nothing of it is taken for one."""
     spool = new_spool(tmp_path / 'spool')
     spool.open()
@@ -177,7 +177,7 @@ def test_the_session_is_that_of_the_node(tmp_path: Path) -> None:
     assert session.started == '2025-10-18T12:00:00.000000Z'
 
 
-def test_no_spool_and_a_damaged_one_are_answers(tmp_path: Path) -> None:
+def test_a_missing_and_a_damaged_spool_are_reported(tmp_path: Path) -> None:
     """Both are told among the findings, and leave the spool unknown."""
     found = read(tmp_path, 'thor', FakeClock())
     assert found.spool is None
@@ -235,20 +235,20 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ),
     ],
 )
-def test_findings_of_the_status(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:
+def test_each_fault_of_a_running_node_is_a_finding(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:
     """Each loss and each fault of a running node is a finding."""
     written(tmp_path, **changes)
     assert finding in read(tmp_path, 'thor', FakeClock()).findings
 
 
 @pytest.mark.parametrize('name', ['idle', 'shipping', 'not_draining'])
-def test_a_store_that_works_is_no_finding(tmp_path: Path, name: str) -> None:
+def test_a_working_store_is_not_a_finding(tmp_path: Path, name: str) -> None:
     """Nor is one that another process delivers to, nor what lies in quarantine from before."""
     written(tmp_path, store={'state': name}, spool={'quarantined': 5}, topics={'/imu': {'skipped': 9, 'open': 3}})
     assert read(tmp_path, 'thor', FakeClock()).findings == ()
 
 
-def test_the_robots_that_have_written_here(tmp_path: Path) -> None:
+def test_the_robots_of_a_spool_are_listed(tmp_path: Path) -> None:
     """Known by their files; other files are nobody's."""
     written(tmp_path, robot='thor')
     written(tmp_path, robot='robot_1.a')
@@ -263,7 +263,7 @@ def test_a_clock_that_is_not_set_is_a_finding(tmp_path: Path, words: str, *, gav
     assert f'the clock of this machine is not set: {words}' in read(tmp_path, 'thor', FakeClock()).findings
 
 
-def test_an_unknown_age(tmp_path: Path) -> None:
+def test_an_unknown_age_is_unknown(tmp_path: Path) -> None:
     """What was spooled before the clock was set has not waited since 1970."""
     clock = FakeClock(60 * SECOND)
     spool = new_spool(tmp_path, clock)
@@ -276,7 +276,7 @@ def test_an_unknown_age(tmp_path: Path) -> None:
     spool.close()
 
 
-def test_other_processes_use_the_nodes_limits(tmp_path: Path) -> None:
+def test_other_processes_use_the_limits_of_the_node(tmp_path: Path) -> None:
     """The widest of several nodes' limits; where none has run, or an old one did not say, those of one's own."""
     assert limits(tmp_path, OWN) == OWN
     written(tmp_path, spool={'max_bytes': 9 << 20})

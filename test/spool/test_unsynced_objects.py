@@ -76,7 +76,7 @@ def said(root: Path) -> list[dict[str, Any]]:
     return [json.loads(row['metadata']) for row in rows(root)]
 
 
-def test_an_object_of_a_clock_that_is_set(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
+def test_an_object_of_a_set_clock_is_not_held(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
     """It keeps its key and its date, and says when it was by the boot clock."""
     clocks.set()
     (item,) = started().take({'key': FINAL})
@@ -86,7 +86,7 @@ def test_an_object_of_a_clock_that_is_set(started: Callable[..., Run], root: Pat
     assert 'key_pattern' not in item.metadata
 
 
-def test_it_waits_for_the_clock(started: Callable[..., Run], root: Path) -> None:
+def test_an_object_waits_for_the_clock(started: Callable[..., Run], root: Path) -> None:
     """Held, under a name by the boot clock, and nothing of it says 1970."""
     run = started()
     assert run.take() == []
@@ -101,7 +101,9 @@ def test_it_waits_for_the_clock(started: Callable[..., Run], root: Path) -> None
 
 
 @pytest.mark.parametrize('restart', [False, True])
-def test_it_is_dated_when_the_clock_is_set(started: Callable[..., Run], root: Path, clocks: Clocks, *, restart: bool) -> None:
+def test_an_object_is_dated_when_the_clock_is_set(
+    started: Callable[..., Run], root: Path, clocks: Clocks, *, restart: bool
+) -> None:
     """Key, times and metadata are those of UTC, also in a later process of the same boot; its bytes are what they were."""
     run = started()
     run.take({'body': b'one'}, {'body': b'two'})
@@ -130,7 +132,7 @@ def test_objects_encoded_after_the_clock_was_set_are_dated_immediately(started: 
     assert (dated.key, dated.held, dated.t_start_ns, dated.metadata['clock']) == (FINAL, None, NOON_NS, 'set_later')
 
 
-def test_a_publisher_that_knows_the_time_is_believed(started: Callable[..., Run], clocks: Clocks) -> None:
+def test_the_time_of_a_publisher_with_a_set_clock_is_used(started: Callable[..., Run], clocks: Clocks) -> None:
     """Its object goes under its date at once, though our clock is not set; by the boot clock it was just now."""
     run = started()
     item = run.made(FINAL, t_start_ns=NOON_NS, t_end_ns=NOON_NS + SECOND)
@@ -140,7 +142,7 @@ def test_a_publisher_that_knows_the_time_is_believed(started: Callable[..., Run]
     assert dated.metadata['boot_start_ns'] == str(clocks.boot_ns() - SECOND)
 
 
-def test_after_ten_minutes_they_go_without_a_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
+def test_after_ten_minutes_objects_are_sent_without_a_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
     """What is held and what comes after keep the names by the boot clock, and say that they have no date."""
     run = started()
     run.take()
@@ -154,7 +156,7 @@ def test_after_ten_minutes_they_go_without_a_date(started: Callable[..., Run], r
     assert run.take()[0].metadata['clock'] == 'set'
 
 
-def test_what_an_earlier_boot_left(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
+def test_objects_of_an_earlier_boot_are_sent_without_a_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
     """Its clock never was set: no later one can date it, and it goes at once, whatever the clock of now is."""
     started().take()
     clocks.boot_id, clocks.up_ns = 'next-boot', 20 * SECOND
@@ -165,7 +167,7 @@ def test_what_an_earlier_boot_left(started: Callable[..., Run], root: Path, cloc
     assert [item.key for item in run.unsynced.step()] == [FINAL]
 
 
-def test_objects_of_an_earlier_boot_with_a_set_clock(started: Callable[..., Run], clocks: Clocks) -> None:
+def test_objects_of_an_earlier_boot_are_dated_by_its_offset(started: Callable[..., Run], clocks: Clocks) -> None:
     """A process that ended before it could name them left the offset of its boot."""
     run = started()
     run.take()
@@ -175,7 +177,7 @@ def test_objects_of_an_earlier_boot_with_a_set_clock(started: Callable[..., Run]
     assert [item.key for item in started().unsynced.step()] == [FINAL]
 
 
-def test_a_lost_index_costs_no_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
+def test_dates_survive_the_loss_of_the_index(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
     """What is needed for it lies with the file."""
     run = started()
     run.take()
@@ -190,7 +192,7 @@ def test_a_lost_index_costs_no_date(started: Callable[..., Run], root: Path, clo
 
 
 @pytest.mark.parametrize('pattern', ['../{date}/{time}', 'thor/{date}', '', 'a' * 300])
-def test_a_changed_key_pattern(started: Callable[..., Run], pattern: str, clocks: Clocks) -> None:
+def test_a_changed_key_pattern_does_not_stop_the_others(started: Callable[..., Run], pattern: str, clocks: Clocks) -> None:
     """A name that cannot be one does not stop the others: it goes without a date, or under what is left of its pattern."""
     run = started()
     run.take({}, {'key_pattern': 'x'})
@@ -204,7 +206,7 @@ def test_a_changed_key_pattern(started: Callable[..., Run], pattern: str, clocks
     assert keys[1] == 'x'
 
 
-def test_many_are_named_in_steps(started: Callable[..., Run], clocks: Clocks) -> None:
+def test_many_objects_are_named_in_steps(started: Callable[..., Run], clocks: Clocks) -> None:
     """Each step is bounded, the oldest first, and in the end all have their names."""
     run = started()
     run.take(*({'body': b'%d' % number} for number in range(STEP + 5)))
@@ -231,7 +233,7 @@ def test_the_ledger_names_the_state(started: Callable[..., Run], root: Path, clo
 
 
 @pytest.mark.parametrize('content', [b'', b'{}', b'[]', b'{"offsets": [], "is_set": 1, "steps": "x"}', b'\xff'])
-def test_a_record_that_cannot_be_read(started: Callable[..., Run], root: Path, content: bytes, clocks: Clocks) -> None:
+def test_an_unreadable_record_is_ignored(started: Callable[..., Run], root: Path, content: bytes, clocks: Clocks) -> None:
     """It begins anew; nothing else depends on it."""
     run = started()
     file(root, 'thor').write_bytes(content)
@@ -242,7 +244,7 @@ def test_a_record_that_cannot_be_read(started: Callable[..., Run], root: Path, c
     assert ledger.read(root, 'thor')['clock']['steps'] == 1
 
 
-def test_a_record_that_cannot_be_written(started: Callable[..., Run], root: Path, clocks: Clocks,
+def test_a_record_that_cannot_be_written_stops_nothing(started: Callable[..., Run], root: Path, clocks: Clocks,
                                          caplog: pytest.LogCaptureFixture) -> None:  # fmt: skip
     """Dates are given all the same."""
     run = started()
@@ -267,7 +269,7 @@ def test_a_record_keeps_few_boots(root: Path, clocks: Clocks) -> None:
     assert again.offsets()[f'boot-{BOOTS + 2}'] == clocks.offset_ns
 
 
-def test_a_held_object_that_has_a_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
+def test_a_held_object_with_a_date_is_released(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
     """Whatever made it, it does not wait for ever: it goes as it is once the clock is set."""
     run = started()
     run.take()

@@ -58,7 +58,7 @@ def opened(spool: Spool) -> Iterator[Callable[..., SpoolWriter]]:
         item.close(5)
 
 
-def test_what_was_put_is_durable_after_a_flush(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
+def test_objects_are_durable_after_a_flush(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
     """A flush returns when all objects put before it are in the spool, and tells the uploader of them."""
     told: list[SpooledObject] = []
     writing = opened(60.0, spooled=told.extend)
@@ -83,7 +83,7 @@ def test_a_burst_is_one_commit(opened: Callable[..., SpoolWriter], commits: list
     assert commits == [5]
 
 
-def test_a_burst_that_does_not_end_is_committed_all_the_same(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:
+def test_a_burst_without_end_is_committed_anyway(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:
     """Even if more objects are always being made."""
     writing = opened(0.1, expects=lambda: True)
     writing.put(make('first', topic=None))
@@ -104,7 +104,7 @@ def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool,
     assert len(commits) <= 4
 
 
-def test_what_stays_here_waits_for_others(opened: Callable[..., SpoolWriter], root: Path, commits: list[int]) -> None:
+def test_kept_objects_wait_for_others_to_commit(opened: Callable[..., SpoolWriter], root: Path, commits: list[int]) -> None:
     """It is committed with the next object that does not, or by itself after a heartbeat, or once it is much."""
     kept: dict[str, Any] = {'topic': None, 'metadata': {meta.SHIP: meta.ON_REQUEST}}
     writing = opened(0.0)
@@ -124,7 +124,7 @@ def test_what_stays_here_waits_for_others(opened: Callable[..., SpoolWriter], ro
 
 
 @pytest.mark.parametrize(('count', 'size'), [(200, 10), (20, 1 << 20)])
-def test_a_burst_does_not_hold_the_index(
+def test_a_burst_does_not_lock_the_index(
     opened: Callable[..., SpoolWriter], spool: Spool, root: Path, commits: list[int], count: int, size: int
 ) -> None:
     """What comes at once is committed in parts, in its order: between them other processes get their turn."""
@@ -163,7 +163,7 @@ def test_outcomes_wait_for_an_object(
     assert settled.wait(60)
 
 
-def test_a_thread_that_dies_in_a_commit(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
+def test_a_thread_that_fails_in_a_commit_loses_nothing(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
                                         monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """All that was to be committed is committed by the next round, once."""
     monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
@@ -247,7 +247,7 @@ def disk_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DiskOf:
     return of
 
 
-def test_files_that_leave_make_way_for_a_commit(
+def test_removing_files_does_not_delay_a_commit(
     opened: Callable[..., SpoolWriter], spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What comes while they are removed is durable before all of them are gone; at the end they are."""
@@ -307,7 +307,7 @@ def test_files_are_removed_while_outcomes_are_settled(
     assert_whole(root)
 
 
-def test_files_that_leave_make_room_before_anything_is_evicted(
+def test_delivered_files_are_removed_before_anything_is_evicted(
     root: Path, disk_of: DiskOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where the disk is short by ``spool.min_free_bytes`` alone, and what was delivered had a commit of its own."""
@@ -385,7 +385,7 @@ def test_files_of_a_full_disk_make_room_for_the_rest(opened: Callable[..., Spool
     assert assert_whole(root)['objects']['evicted'] == 3
 
 
-def test_encoders_wait_while_too_much_waits(opened: Callable[..., SpoolWriter], spool: Spool,
+def test_encoders_wait_while_the_queue_is_full(opened: Callable[..., SpoolWriter], spool: Spool,
                                             monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """With the disk hung, put blocks once the bytes are too many, and goes on when the disk does."""
     monkeypatch.setattr(writer_module, 'MAX_WAITING_BYTES', 10)
@@ -410,7 +410,7 @@ def test_encoders_wait_while_too_much_waits(opened: Callable[..., SpoolWriter], 
     assert spool.pending_count() == 2
 
 
-def test_a_bad_key_is_refused_at_once(opened: Callable[..., SpoolWriter]) -> None:
+def test_an_invalid_key_is_refused_immediately(opened: Callable[..., SpoolWriter]) -> None:
     """It is the caller's error, and does not stop the commits of others."""
     writing = opened()
     with pytest.raises(NameRefused):

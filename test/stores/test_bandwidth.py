@@ -111,7 +111,7 @@ def test_a_yielding_body_is_sent_after_its_equals() -> None:
     assert span[: len(span) - span[::-1].index('live')].count('part') / span.count('live') < 0.8
 
 
-def test_of_bodies_alike_the_first_one_is_finished_first() -> None:
+def test_of_equal_bodies_the_first_is_finished_first() -> None:
     """Sharing would make all of them late."""
     pace, log = Pace(4.0), list[str]()
     first, second = (Sender(pace.pieces(bytes(150_000), 5), log, name) for name in ('first', 'second'))
@@ -159,7 +159,7 @@ def test_recent_throughput_is_measured() -> None:
 
 
 @pytest.mark.parametrize('cap', [-1.0, float('inf'), float('nan')])
-def test_what_is_no_cap_is_refused(cap: float) -> None:
+def test_an_invalid_cap_is_refused(cap: float) -> None:
     """And the old one stays."""
     pace = Pace(3.0)
     with pytest.raises(ValueError, match='not a cap'):

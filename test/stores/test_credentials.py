@@ -60,13 +60,13 @@ def clock() -> list[float]:
     return [100.0]
 
 
-def test_the_default_profile(file: File) -> None:
+def test_the_default_profile_is_used(file: File) -> None:
     """Of the file that the variable names, with its token."""
     file.write('KEY', SECRET, aws_session_token='token')
     assert Keys(OWN).get_frozen_credentials()[:3] == ('KEY', SECRET, 'token')
 
 
-def test_the_file_in_the_home(file: File, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_credentials_file_in_the_home_is_used(file: File, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no variable names another one."""
     monkeypatch.delenv('AWS_SHARED_CREDENTIALS_FILE')
     (tmp_path / '.aws').mkdir()
@@ -74,7 +74,7 @@ def test_the_file_in_the_home(file: File, tmp_path: Path, monkeypatch: pytest.Mo
     assert Keys(OWN).get_frozen_credentials().access_key == 'KEY'
 
 
-def test_another_profile(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_named_profile_is_used(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
     """AWS_PROFILE names it; of the configuration file as well."""
     file.write('KEY', SECRET, 'robot')
     monkeypatch.setenv('AWS_PROFILE', 'robot')
@@ -121,7 +121,7 @@ def test_the_tables_of_the_lake_are_read_with_the_same_profile(file: File, monke
         storage_options(OWN)
 
 
-def test_keys_in_the_settings_come_first_and_stay(file: File) -> None:
+def test_keys_in_the_settings_take_precedence(file: File) -> None:
     """The environment of a process cannot change: nothing is read again."""
     file.write('KEY', SECRET)
     keys = Keys(dataclasses.replace(OWN, access_key_id='FIRST', secret_access_key='first'))
@@ -129,7 +129,7 @@ def test_keys_in_the_settings_come_first_and_stay(file: File) -> None:
     assert not keys.renew(keys.generation)
 
 
-def test_half_a_pair_stops_the_start() -> None:
+def test_half_a_key_pair_aborts_startup() -> None:
     """The other half is named."""
     with pytest.raises(SettingError, match='AWS_SECRET_ACCESS_KEY'):
         Keys(dataclasses.replace(OWN, access_key_id='FIRST'))
@@ -164,7 +164,7 @@ def test_refused_keys_are_read_again(file: File, clock: list[float]) -> None:
     assert keys.get_frozen_credentials()[:2] == ('NEW', 'new')
 
 
-def test_many_refusals_are_one_reading(file: File, clock: list[float]) -> None:
+def test_many_refusals_cause_one_reading(file: File, clock: list[float]) -> None:
     """Who was refused with the old keys hears of the new ones without reading; who was refused with the new ones waits."""
     file.write('OLD', 'old')
     keys = Keys(OWN, lambda: clock[0])
@@ -179,7 +179,7 @@ def test_many_refusals_are_one_reading(file: File, clock: list[float]) -> None:
     assert keys.get_frozen_credentials().access_key == 'NEW'
 
 
-def test_keys_that_come_later(file: File, clock: list[float]) -> None:
+def test_keys_that_are_added_later_are_used(file: File, clock: list[float]) -> None:
     """A file that is put there while the program runs is found; half of one is said to be half."""
     keys = Keys(OWN, lambda: clock[0])
     with pytest.raises(NoCredentialsError):

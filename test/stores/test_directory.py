@@ -49,7 +49,7 @@ def test_the_folder_is_laid_out_like_the_bucket(store: DirectoryStore, folder: P
     assert files == {'sensor-data/thor/camera/a.jpg', '.metadata/sensor-data/thor/camera/a.jpg.json'}
 
 
-def test_what_a_power_cut_left_is_completed(store: DirectoryStore, folder: Path, spool: Spool, bucket: str) -> None:
+def test_objects_interrupted_by_a_power_cut_are_completed(store: DirectoryStore, folder: Path, spool: Spool, bucket: str) -> None:
     """Content without its metadata is recognized by its hash, and the next put writes them."""
     item = spool('a', b'content')
     store.put(item)
@@ -105,7 +105,7 @@ def test_everything_is_synced_before_it_has_its_name(
         (errno.ENAMETOOLONG, ObjectRefused, 'cannot hold'),
     ],
 )
-def test_errors_of_the_file_system(
+def test_errors_of_the_file_system_are_translated(
     number: int, kind: type[StoreError], words: str,
     store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -121,7 +121,7 @@ def test_errors_of_the_file_system(
     assert store.put(item) is Put.CREATED
 
 
-def test_a_folder_that_cannot_be_one_condemns_no_object(spool: Spool) -> None:
+def test_an_unusable_folder_quarantines_no_object(spool: Spool) -> None:
     """A wrong setting (the folder is a file, or below one) is waited for, by put and by probe."""
     item = spool('a', b'x')
     for folder in (item.path, item.path / 'below'):
@@ -140,7 +140,9 @@ def test_an_object_is_no_folder_and_a_folder_no_object(store: DirectoryStore, sp
             store.put(spool(key, b'y'))
 
 
-def test_a_file_system_without_links(store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_store_works_on_a_file_system_without_links(
+    store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without hard links (exFAT) objects are still whole and never overwritten."""
     monkeypatch.setattr(os, 'link', _failing(errno.EPERM))
     assert store.put(spool('a', b'first')) is Put.CREATED

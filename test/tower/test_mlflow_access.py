@@ -1,11 +1,16 @@
-"""Attacks on a real MLflow server of a Tower: by a stranger, with a robot's password and with Spark's; and what each is for."""
+"""Attacks on a real MLflow server of a Tower: by a stranger, with a robot's password and with Spark's; and what each is for.
+
+What a hostile robot writes into its runs, in the browser of whoever looks at MLflow's pages as Spark.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -115,7 +120,7 @@ DOORS = [
 
 
 @pytest.mark.parametrize('name', ['', 'nobody', 'mlflow', 'thor'])
-def test_without_a_password_no_door_opens(users: dict[str, User], tower: Tower, name: str) -> None:
+def test_without_a_password_nothing_is_accessible(users: dict[str, User], tower: Tower, name: str) -> None:
     """A stranger, a user that is none and a user with the wrong password get 401 or 403 of everything but the health."""
     user = User(tower, name, users[''].http, password='guess')
     opened = {(method, path): status for method, path in DOORS
@@ -319,7 +324,7 @@ def test_no_model_comes_from_elsewhere(users: dict[str, User], run: dict[str, An
         assert spark.status('POST', '/api/2.0/mlflow/model-versions/create', {'name': 'policy', 'source': place, **more}) == 400
 
 
-def test_spark_looks_at_missions_and_keeps_its_own(users: dict[str, User], run: dict[str, Any]) -> None:
+def test_spark_reads_missions_and_writes_its_own_runs(users: dict[str, User], run: dict[str, Any]) -> None:
     """It reads every robot's runs and changes none; experiments and models of its own it makes, and deletes."""
     spark = users['spark']
     read = spark.call('POST', 'runs/search', {'experiment_ids': [run['experiment_id']]})['runs']
@@ -369,7 +374,7 @@ def test_a_second_password_is_valid_immediately(users: dict[str, User], tower: T
         put(before)
 
 
-def test_its_files_hold_no_password(tower: Tower) -> None:
+def test_the_files_contain_no_password(tower: Tower) -> None:
     """Neither files, logs nor command lines; and what holds addresses is its owner's alone."""
     folder = tower._folder
     words = {tower.tracking(name)['MLFLOW_TRACKING_PASSWORD'].encode() for name in ('tower', 'spark', 'thor', 'tachi')}
@@ -416,7 +421,7 @@ def test_only_an_address_that_guesses_must_wait(tower: Tower) -> None:
     assert Neighbor(tower, '127.0.0.1').status('spark', password) == (200, None)
 
 
-def test_what_is_remembered_of_wrong_passwords_is_bounded() -> None:
+def test_the_memory_of_wrong_passwords_is_bounded() -> None:
     """Any number of addresses may guess; those that guess now are remembered, and a wait ends."""
     now = [0.0]
     wrong = mlflow_access.WrongPasswords(lambda: now[0])
@@ -514,3 +519,111 @@ def test_no_user_can_make_the_server_fetch_a_url(users: dict[str, User], name: s
     ]  # fmt: skip
     for method, path, body in asked:
         assert users[name].status(method, path, body) in {401, 403}, path
+
+
+CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
+EVIL = (
+    '<img src=x onerror="window.top.pwned=1"><script>window.pwned=1</script>"\'><svg onload="window.pwned=1">'
+    '[x](javascript:pwned=1)'
+)
+NOTE = (
+    f'{EVIL}\n\n<iframe src="javascript:top.pwned=1"></iframe>\n\n[click](javascript:alert(1)) '
+    '<a href="javascript:alert(1)">here</a>'
+)
+TAGS = {
+    'mlflow.note.content': NOTE, 'mlflow.runName': EVIL, 'mlflow.user': EVIL, 'mlflow.source.name': 'javascript:alert(1)',
+    'mlflow.source.type': 'PROJECT', 'mlflow.source.git.repoURL': 'javascript:alert(1)', 'mlflow.source.git.commit': EVIL,
+    'mlflow.source.git.branch': EVIL, 'mlflow.project.entryPoint': EVIL, 'mlflow.gitRepoURL': 'javascript:alert(1)',
+    'mlflow.databricks.notebookURL': 'javascript:alert(1)', 'mlflow.datasets': EVIL, 'policy': EVIL,
+    'mlflow.loggedArtifacts': json.dumps([{'path': EVIL, 'type': 'table'}]),
+    'mlflow.log-model.history': json.dumps([{'artifact_path': EVIL, 'run_id': 'x', 'flavors': {EVIL: {}}, 'model_uuid': EVIL}]),
+}  # fmt: skip
+SANDBOXES = 'all => all.map(one => one.getAttribute("sandbox"))'
+LOOK_MS = 1500
+"""For whatever a page shows to run, after it is shown."""
+PAGE = b"""<html><body><script>
+try { window.top.pwned = 1 } catch (error) {}
+fetch('/ajax-api/2.0/mlflow/users/current').then(answer => { document.title = 'read ' + answer.status; alert('read') })
+</script></body></html>"""
+SVG = b'<svg xmlns="http://www.w3.org/2000/svg"><script>window.top.pwned=1;alert(1)</script></svg>'
+ARTIFACTS = {
+    'a.html': PAGE, 'a.htm': PAGE, 'a.svg': SVG, 'a.md': NOTE.encode(), 'a.txt': NOTE.encode(), 'a.csv': EVIL.encode(),
+    'a.json': json.dumps({EVIL: EVIL}).encode(), 'table.json': json.dumps({'columns': [EVIL], 'data': [[EVIL]]}).encode(),
+    'a.xhtml': b'<html xmlns="http://www.w3.org/1999/xhtml"><script>window.top.pwned=1</script></html>',
+    'a.jpg': PAGE, 'none': PAGE,
+    'a.geojson': json.dumps({'type': 'Feature', 'properties': {'popupContent': EVIL},
+                             'geometry': {'type': 'Point', 'coordinates': [1, 1]}}).encode(),
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def browse(tower: Tower) -> Iterator[dict[str, Any]]:
+    """One of thor's, with whatever a robot can write."""
+    thor = User(tower, 'thor')
+    experiment = thor.experiment('thor_missions')
+    made = thor.run(experiment)
+    for key, value in TAGS.items():
+        thor.call('POST', 'runs/set-tag', {'run_id': made['run_id'], 'key': key, 'value': value})
+    note = {'experiment_id': experiment, 'key': 'mlflow.note.content', 'value': NOTE}
+    thor.call('POST', 'experiments/set-experiment-tag', note)
+    thor.call('POST', 'runs/log-batch', {'run_id': made['run_id'], 'params': [{'key': 'p', 'value': EVIL}]})
+    for name, body in ARTIFACTS.items():
+        assert thor.status('PUT', _artifact(made, name), body) == 200
+    yield made
+    thor.http.clear()
+
+
+@pytest.mark.parametrize('name', ARTIFACTS)
+def test_no_artifact_is_shown_as_a_page_of_the_server(tower: Tower, browse: dict[str, Any], name: str) -> None:
+    """Wherever a robot's artifact is handed out, browsers store it, and guess no type of it."""
+    spark = User(tower, 'spark')
+    places = [_artifact(browse, name), _artifact(browse, name).replace('/api/', '/ajax-api/', 1)]
+    for path in (*places, f'/get-artifact?path={name}&run_uuid={browse["run_id"]}'):
+        answer = spark.send('GET', path)
+        assert answer.status == 200
+        assert answer.headers['Content-Disposition'].startswith('attachment')
+        assert answer.headers['X-Content-Type-Options'] == 'nosniff'
+    spark.http.clear()
+
+
+@pytest.mark.long('a browser that looks at a dozen pages')
+@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+def test_no_script_of_a_robot_runs_in_mlflows_pages(tower: Tower, browse: dict[str, Any]) -> None:
+    """Tags, notes, params and artifacts are shown: none opens a dialog, is a link that runs, or gets hold of the page."""
+    password = tower.tracking('spark')['MLFLOW_TRACKING_PASSWORD']
+    place = f'/#/experiments/{browse["experiment_id"]}'
+    pages = [place, f'{place}/runs', f'{place}/runs/{browse["run_id"]}',
+             *(f'{place}/runs/{browse["run_id"]}/artifacts/{name}' for name in ARTIFACTS)]  # fmt: skip
+
+    expected = {path: path.rpartition('/')[2] if '/artifacts/' in path else 'Model training' for path in pages}
+
+    async def poll() -> dict[str, Any]:
+        from playwright.async_api import async_playwright
+
+        found: dict[str, Any] = {}
+        async with async_playwright() as playwright:
+            browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
+            context = await browser.new_context(http_credentials={'username': 'spark', 'password': password})
+            for path in pages:
+                page, dialogs = await context.new_page(), list[str]()
+                page.on('dialog', lambda dialog, dialogs=dialogs: (dialogs.append(dialog.message), dialog.dismiss())[1])
+                await page.goto(tower.tracking_uri + path)
+                await page.wait_for_function('expected => document.body.innerText.includes(expected)', arg=expected[path])
+                if path.endswith('.html'):
+                    await page.locator('iframe[src^="blob:"]').wait_for(state='attached')
+                await page.wait_for_timeout(LOOK_MS)
+                found[path] = {
+                    'dialogs': dialogs, 'pwned': await page.evaluate('window.pwned'),
+                    'links': await page.locator('a[href^="javascript:" i], iframe[src^="javascript:" i]').count(),
+                    'frames': await page.eval_on_selector_all('iframe[src]', SANDBOXES),
+                }  # fmt: skip
+                await page.close()
+            await browser.close()
+        return found
+
+    found = asyncio.run(poll())
+    assert len(found) == len(pages)
+    assert {path: each for path, each in found.items() if each['dialogs'] or each['pwned'] or each['links']} == {}
+    frames = [sandbox for each in found.values() for sandbox in each['frames']]
+    assert 'allow-scripts' in frames  # the HTML page, in an origin of its own
+    assert set(frames) <= {'allow-scripts'}

@@ -70,7 +70,7 @@ def _works(folder: Path, offset: int, key: dict[str, str]) -> bool:
     return True
 
 
-def test_others_reach_nothing_that_asks_for_no_key(folder: Path, offset: int) -> None:
+def test_nothing_without_a_key_is_reachable(folder: Path, offset: int) -> None:
     """Neither the filer, which gives and deletes whatever is stored, nor the volume server, the master and the database."""
     for port in (9333, 8080, 8888, 19333, 18080, 18888, 5432):
         with socket.socket() as one:
@@ -203,7 +203,7 @@ def test_a_key_is_changed_while_it_runs(folder: Path, offset: int) -> None:
     assert _works(folder, offset, new)
 
 
-def test_a_seaweedfs_that_serves_everybody_is_no_tower(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_seaweedfs_without_keys_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that does not ask for the certificate is found out and ended, before robots send to it."""
     make_secrets.make(tmp_path, '127.0.0.1', ['thor'])
     monkeypatch.setattr(run.Runner, '_seaweed_environ', run.Runner._environ)
@@ -214,7 +214,7 @@ def test_a_seaweedfs_that_serves_everybody_is_no_tower(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize(('port', 'name'), [(9000, 'S3'), (5001, 'MLflow'), (9333, 'master')])
-def test_a_port_that_is_taken_is_named(tmp_path: Path, port: int, name: str) -> None:
+def test_a_port_in_use_is_named(tmp_path: Path, port: int, name: str) -> None:
     """A server that is left over is not taken for the one that is started: nothing is started beside it."""
     make_secrets.make(tmp_path, HOST, ['thor'])
     offset = free_offset()

@@ -91,7 +91,7 @@ def swept(content: bytes) -> list[int]:
 
 
 @pytest.mark.parametrize('kind', SWEPT)
-def test_cut_at_every_byte(tmp_path: Path, kind: str) -> None:
+def test_a_file_cut_at_any_byte_keeps_every_complete_chunk(tmp_path: Path, kind: str) -> None:
     """Every message whose chunk is complete is recovered, nothing else than what was written, and the damage is reported."""
     content, ours = written(tmp_path, kind)
     complete, most = spans(content), 0
@@ -107,7 +107,7 @@ def test_cut_at_every_byte(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('mode', [pytest.param(CompressionMode.NONE, marks=MORE), CompressionMode.STORAGE])
-def test_a_file_of_rosbags_cut_at_every_byte(tmp_path: Path, mode: CompressionMode) -> None:
+def test_a_file_of_rosbags_cut_at_any_byte_keeps_every_complete_chunk(tmp_path: Path, mode: CompressionMode) -> None:
     """Its chunks have no checksum; both packages read what is recovered."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     writer = RosbagsWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
@@ -129,7 +129,7 @@ def test_a_file_of_rosbags_cut_at_every_byte(tmp_path: Path, mode: CompressionMo
 
 
 @pytest.mark.parametrize('kind', SWEPT)
-def test_a_bit_that_flipped(tmp_path: Path, kind: str) -> None:
+def test_a_flipped_bit_costs_at_most_its_chunk(tmp_path: Path, kind: str) -> None:
     """In every byte: the messages of other chunks are recovered; with checksums nothing that was not written is in the copy.
 
     Without a summary the first chunk alone has the declarations of the others.
@@ -152,7 +152,7 @@ def test_a_bit_that_flipped(tmp_path: Path, kind: str) -> None:
 
 @HOSTILE
 @given(st.data())
-def test_bytes_that_were_added_or_removed(tmp_path: Path, data: st.DataObject) -> None:
+def test_added_or_removed_bytes_cost_at_most_their_chunk(tmp_path: Path, data: st.DataObject) -> None:
     """In the middle: what comes before and after in other chunks is recovered."""
     content, ours = written(tmp_path, 'lz4')
     at, more = data.draw(st.integers(50, len(content) - 1)), data.draw(st.binary(max_size=40))
@@ -166,7 +166,7 @@ def test_bytes_that_were_added_or_removed(tmp_path: Path, data: st.DataObject) -
             assert {each.sequence for each in held} >= span.sequences
 
 
-def test_damage_between_messages_outside_of_chunks(tmp_path: Path) -> None:
+def test_damage_outside_of_chunks_is_dated_by_its_neighbors(tmp_path: Path) -> None:
     """It is dated by the messages around it, and how many were there is unknown."""
     content, ours = written(tmp_path, 'not chunked')
     ends = [span.end for span in spans(content)]
@@ -199,7 +199,7 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_damage_of_any_kind(tmp_path: Path, kind: str) -> None:
+def test_damage_of_any_kind_gives_a_valid_copy_or_an_error(tmp_path: Path, kind: str) -> None:
     """The copy is valid, or the file is refused; it never fails in another way."""
     content, _ = written(tmp_path, kind)
     rng = random.Random(kind)
@@ -208,7 +208,7 @@ def test_damage_of_any_kind(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize('tail', [b'\0' * 5000, b'\xff' * 300, random.Random(3).randbytes(70_000), b'\x89MCAP0\r\n' * 3])
-def test_bytes_after_the_end(tmp_path: Path, tail: bytes) -> None:
+def test_bytes_after_the_end_are_ignored(tmp_path: Path, tail: bytes) -> None:
     """They are no part of the copy, and no message is lost."""
     content, ours = written(tmp_path, 'zstd')
     found, held = repaired(tmp_path, content + tail)
@@ -239,7 +239,7 @@ def test_a_torn_chunk_gives_what_can_be_unpacked(tmp_path: Path, compression: Co
     assert (loss.from_ns, loss.to_ns) == (NOON_NS, NOON_NS + 999)
 
 
-def test_a_checksum_that_does_not_match(tmp_path: Path) -> None:
+def test_a_wrong_checksum_is_reported(tmp_path: Path) -> None:
     """Its messages are lost, counted and dated, unless they are requested."""
     content, ours = written(tmp_path, 'none')
     at = content.index(bytes([9]) * 20)
@@ -257,7 +257,7 @@ def test_a_checksum_that_does_not_match(tmp_path: Path) -> None:
     assert (found.lost_messages, found.unverified) == (0, len(lost))
 
 
-def test_a_checksum_of_the_data(tmp_path: Path) -> None:
+def test_a_wrong_checksum_of_the_data_section_is_reported(tmp_path: Path) -> None:
     """Where it is all there is, the file is reported, though nothing says what is wrong in it."""
     path = tmp_path / 'data.mcap'
     with path.open('wb') as file:
@@ -283,7 +283,7 @@ def test_unknown_records_are_copied(tmp_path: Path) -> None:
     assert unknown in (tmp_path / 'out.mcap').read_bytes()
 
 
-def test_a_closed_slice_of_ours_heals_its_channels(tmp_path: Path) -> None:
+def test_the_summary_of_a_closed_slice_corrects_its_channels(tmp_path: Path) -> None:
     """Channels outside of chunks have no checksum: the summary, which has one, corrects them."""
     info, done = closed(tmp_path / 'bag_0.mcap', 30)
     content = info.path.read_bytes().replace(b'/echo', b'/ECHO', 1)
@@ -297,7 +297,7 @@ def test_a_closed_slice_of_ours_heals_its_channels(tmp_path: Path) -> None:
 @HOSTILE
 @given(st.lists(st.tuples(st.integers(0, 255), st.sampled_from([0, 1, 22, 1 << 31, 1 << 62, (1 << 64) - 1]),
                           st.binary(max_size=80)), max_size=12))  # fmt: skip
-def test_records_of_any_kind(tmp_path: Path, records: list[tuple[int, int, bytes]]) -> None:
+def test_records_of_any_kind_never_fail(tmp_path: Path, records: list[tuple[int, int, bytes]]) -> None:
     """Lengths up to 2^64 and noise for content never fail."""
     body = b''.join(
         struct.pack('<BQ', op, length if number % 3 == 2 else len(content)) + content
@@ -307,7 +307,7 @@ def test_records_of_any_kind(tmp_path: Path, records: list[tuple[int, int, bytes
 
 
 @pytest.mark.parametrize('claimed', [1000, 100 * MEBI, 1 << 62])
-def test_a_bomb(tmp_path: Path, claimed: int) -> None:
+def test_a_decompression_bomb_takes_the_memory_of_a_chunk(tmp_path: Path, claimed: int) -> None:
     """What unpacks to a gigabyte takes the memory of a chunk at most, and no time to speak of."""
     bomb = compress(bytes(64 * MEBI), 1)
     fields = CHUNK.pack(1, 1, claimed, zlib.crc32(b'x')) + text('zstd') + struct.pack('<Q', len(bomb))

@@ -1,7 +1,12 @@
-"""metadata.yaml: what Humble's and Jazzy's rosbag2 read from it, by the rules of their readers."""
+"""metadata.yaml: what Humble's and Jazzy's rosbag2 read from it, by the rules of their readers.
+
+Whole bags, as this package leaves them in a folder, in other people's readers: `rosbags` by folder, and with its own types.
+"""
 
 from __future__ import annotations
 
+import random
+from collections.abc import Iterator
 from enum import IntEnum
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,12 +14,18 @@ from typing import Any
 
 import pytest
 import yaml
-from bags.slices import TALK
+from bags.slices import TALK, Recorded
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
 
+from shadowhound_data_logger.formats.definitions import describe
+from shadowhound_data_logger.formats.mcap.recovery import recover
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml, offered_qos, qos_in_numbers, to_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 OTHER = Channel('/späti', 'std_msgs/msg/Empty', '', '', '', '')
 
@@ -31,7 +42,7 @@ def read(content: bytes) -> dict[str, Any]:
     return found
 
 
-def test_a_bag_of_several_slices() -> None:
+def test_the_metadata_spans_all_slices() -> None:
     """Times span all slices, counts are sums, files are in order, each topic appears once."""
     slices = [info(0, 100, 200, 2, TALK), info(1, 0, 0, 0, OTHER), info(2, 150, 390, 3, TALK, OTHER)]
     found = read(metadata_yaml(slices, ros_distro='humble', custom_data={'robot': 'thor', 'a b': 'c: "d"'}))
@@ -57,7 +68,7 @@ def test_a_bag_of_several_slices() -> None:
     assert found['custom_data'] == {'robot': 'thor', 'a b': 'c: "d"'}
 
 
-def test_a_bag_of_nothing() -> None:
+def test_a_bag_without_messages_has_metadata() -> None:
     """No slices, or none with messages, is a bag that begins and ends at 0."""
     for slices in ([], [info(0, 0, 0, 0)]):
         found = read(metadata_yaml(slices, ros_distro=''))
@@ -131,7 +142,7 @@ def test_qos_in_words_becomes_numbers() -> None:
 
 
 @pytest.mark.ros
-def test_qos_of_rclpy() -> None:
+def test_qos_of_rclpy_is_accepted() -> None:
     """The QoS that rclpy reports for a publisher can be used directly."""
     qos = pytest.importorskip('rclpy.qos')
     (found,) = yaml.safe_load(offered_qos([qos.qos_profile_sensor_data]))
@@ -148,6 +159,121 @@ values = st.recursive(
 
 
 @given(st.dictionaries(texts, values, min_size=1, max_size=4))
-def test_yaml_is_read_as_it_was_meant(value: dict[str, Any]) -> None:
+def test_yaml_values_keep_their_types(value: dict[str, Any]) -> None:
     """No text is taken for a number, a date or a comment, however it is nested."""
     assert yaml.safe_load(to_yaml(value)) == value
+
+
+QOS = """- history: 1
+  depth: 10
+  reliability: 2
+  durability: 2
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+"""
+STORE = get_typestore(Stores.LATEST)
+NOON_NS = 1_800_000_000_000_000_000
+COUNTS = {'/odom': 60, '/camera/compressed': 20, '/blob': 20}
+
+
+def recorded() -> Iterator[tuple[Channel, Recorded]]:
+    """Odometry and pictures of real types, and a type that no reader knows."""
+    odom, picture = (
+        Channel(topic, kind, *describe(kind), QOS)
+        for topic, kind in (('/odom', 'nav_msgs/msg/Odometry'), ('/camera/compressed', 'sensor_msgs/msg/CompressedImage'))
+    )
+    blob = Channel('/blob', 'nowhere/msg/Blob', *describe('nowhere/msg/Blob'), '')
+    header = STORE.types['std_msgs/msg/Header'](stamp=STORE.types['builtin_interfaces/msg/Time'](7, 8), frame_id='camera')
+    jpeg = random.Random(1).randbytes(3000)
+    image = STORE.types[picture.type](header=header, format='jpeg', data=memoryview(jpeg).cast('B'))
+    for number in range(100):
+        at = NOON_NS + number * 10_000_000
+        if number % 5 == 0:
+            yield picture, Recorded(picture.topic, at, at - 100, number, _image(image, jpeg))
+        elif number % 5 == 1:
+            yield blob, Recorded(blob.topic, at, at - 100, number, number.to_bytes(9, 'little'))
+        else:
+            yield odom, Recorded(odom.topic, at, at - 100, number, _odometry(float(number)))
+
+
+def _image(image: object, jpeg: bytes) -> bytes:
+    import numpy as np
+
+    image.data = np.frombuffer(jpeg, np.uint8)  # type: ignore[attr-defined]
+    return bytes(STORE.serialize_cdr(image, 'sensor_msgs/msg/CompressedImage'))
+
+
+def _odometry(x: float) -> bytes:
+    import numpy as np
+
+    make = {name.rpartition('/')[2]: kind for name, kind in STORE.types.items() if name.startswith(('geometry_msgs', 'std_msgs'))}
+    zero = make['Vector3'](0.0, 0.0, 0.0)
+    pose = make['Pose'](make['Point'](x, 0.0, 0.0), make['Quaternion'](0.0, 0.0, 0.0, 1.0))
+    message = STORE.types['nav_msgs/msg/Odometry'](
+        header=make['Header'](STORE.types['builtin_interfaces/msg/Time'](1, 2), 'odom'), child_frame_id='base_link',
+        pose=make['PoseWithCovariance'](pose, np.zeros(36)),
+        twist=make['TwistWithCovariance'](make['Twist'](zero, zero), np.zeros(36)),
+    )  # fmt: skip
+    return bytes(STORE.serialize_cdr(message, 'nav_msgs/msg/Odometry'))
+
+
+@pytest.fixture(params=['none', 'zstd'])
+def bag(tmp_path: Path, request: pytest.FixtureRequest) -> tuple[Path, list[Recorded]]:
+    """Four slices: three closed, the last one recovered, and their metadata.yaml."""
+    folder, slices, written = tmp_path / 'patrol', [], []
+    folder.mkdir()
+    stream = list(recorded())
+    for number in range(4):
+        path = folder / f'patrol_{number}.mcap'
+        writer = SliceWriter(path, compression=request.param, chunk_bytes=4000)
+        for channel, one in stream[number * 25 : number * 25 + 25]:
+            writer.write(channel, one.log_ns, one.publish_ns, one.sequence, one.cdr)
+            written.append(one)
+        slices.append(_ended(writer, path, killed=number == 3))
+    (folder / 'metadata.yaml').write_bytes(metadata_yaml(slices, ros_distro='humble', custom_data={'robot': 'thor'}))
+    return folder, written
+
+
+def _ended(writer: SliceWriter, path: Path, *, killed: bool) -> SliceInfo:
+    if not killed:
+        return writer.close()
+    writer.sync()
+    writer.abort()
+    return recover(path.with_name(f'{path.name}.open'))
+
+
+def test_rosbags_reads_a_folder_of_slices(bag: tuple[Path, list[Recorded]]) -> None:
+    """Counts, times, QoS, types and every byte, over all slices."""
+    folder, written = bag
+    with Reader(folder) as reader:
+        assert (reader.message_count, reader.start_time, reader.duration) == (100, NOON_NS, 990_000_001)
+        assert {one.topic: one.msgcount for one in reader.connections} == COUNTS
+        assert [(one.topic, at, bytes(data)) for one, at, data in reader.messages()] == [
+            (one.topic, one.log_ns, one.cdr) for one in written
+        ]
+        (odom,) = [one for one in reader.connections if one.topic == '/odom']
+        assert odom.ext.offered_qos_profiles[0].depth == 10  # type: ignore[union-attr]
+        assert odom.digest in {STORE.hash_rihs01('nav_msgs/msg/Odometry'), ''}
+
+
+def test_rosbags_decodes_messages_with_the_types_of_the_bag(bag: tuple[Path, list[Recorded]]) -> None:
+    """Messages are decoded with the definitions in the slices only; an unknown type does not prevent that."""
+    folder, _ = bag
+    with AnyReader([folder]) as reader:
+        wanted = [one for one in reader.connections if one.topic == '/odom']
+        found = [
+            reader.deserialize(data, one.msgtype).pose.pose.position.x  # type: ignore[attr-defined]
+            for one, _, data in reader.messages(connections=wanted)
+        ]
+    assert found == [float(number) for number in range(100) if number % 5 > 1]
+
+
+def test_rosbags_reads_a_single_slice(bag: tuple[Path, list[Recorded]]) -> None:
+    """A single slice is a bag, from which a time range can be read."""
+    folder, written = bag
+    with AnyReader([folder / 'patrol_2.mcap']) as reader:
+        found = [(one.topic, at) for one, at, _ in reader.messages(start=written[55].log_ns, stop=written[60].log_ns)]
+    assert found == [(one.topic, one.log_ns) for one in written[55:60]]

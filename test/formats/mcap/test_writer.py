@@ -19,14 +19,14 @@ from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
-def test_what_goes_in_comes_out(tmp_path: Path, compression: str) -> None:
+def test_messages_are_read_as_written(tmp_path: Path, compression: str) -> None:
     """Topic, both stamps, sequence and bytes of every message are read back, through the indexes and without them."""
     info, written = closed(tmp_path / 'bag_0.mcap', 300, compression=compression, sync_every=70)
     assert indexed(info.path) == in_order(info.path) == written
     check(info.path)
 
 
-def test_the_info_is_the_files(tmp_path: Path) -> None:
+def test_the_returned_info_describes_the_file(tmp_path: Path) -> None:
     """Size, SHA-256, times, counts and channels are those of the file that was closed."""
     info, written = closed(tmp_path / 'bag_0.mcap', 100)
     content = info.path.read_bytes()
@@ -59,7 +59,7 @@ def test_the_summary_is_as_rosbag2_writes_it(tmp_path: Path) -> None:
     assert 'version: 8' in record.metadata['serialized_metadata']
 
 
-def test_no_name_before_the_end(tmp_path: Path) -> None:
+def test_a_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
     """The file is ``.open`` until it is closed, and neither name is ever taken from another file."""
     path = tmp_path / 'bag_0.mcap'
     writer = SliceWriter(path)
@@ -104,7 +104,7 @@ def test_a_chunk_ends_automatically(tmp_path: Path) -> None:
     check(info.path)
 
 
-def test_what_does_not_shrink_is_left_alone(tmp_path: Path) -> None:
+def test_incompressible_chunks_are_stored(tmp_path: Path) -> None:
     """A chunk that zstd does not make smaller (images) is stored uncompressed, so readers need not unpack it."""
     noise = random.Random(1).randbytes(20_000)
     writer = SliceWriter(tmp_path / 'bag_0.mcap', compression='zstd')
@@ -119,7 +119,7 @@ def test_what_does_not_shrink_is_left_alone(tmp_path: Path) -> None:
     assert [one.cdr for one in indexed(info.path)] == [noise, bytes(20_000)]
 
 
-def test_invalid_stamps(tmp_path: Path) -> None:
+def test_invalid_stamps_are_replaced(tmp_path: Path) -> None:
     """A publisher's stamp that is not known is the log time, a time before 1970 is 1970, a sequence wraps."""
     writer = SliceWriter(tmp_path / 'bag_0.mcap')
     writer.write(TALK, 50, 0, (1 << 32) + 7, b'1234')
@@ -128,7 +128,7 @@ def test_invalid_stamps(tmp_path: Path) -> None:
     assert indexed(info.path) == [Recorded('/talk', 0, 0, 0, b'1234'), Recorded('/talk', 50, 50, 7, b'1234')]
 
 
-def test_a_topic_changes_its_type(tmp_path: Path) -> None:
+def test_a_topic_may_change_its_type(tmp_path: Path) -> None:
     """Each message is decoded with the type it was published with, on a channel with its QoS."""
     other = Channel('/talk', 'std_msgs/msg/Empty', 'ros2msg', '', '', '')
     again = Channel('/talk', TALK.type, 'ros2msg', STRING_WITH_COMMENT, '', '- history: 1\n')
@@ -146,7 +146,7 @@ def test_a_topic_changes_its_type(tmp_path: Path) -> None:
 STRING_WITH_COMMENT = '# the same\nstring data\n'
 
 
-def test_an_empty_slice(tmp_path: Path) -> None:
+def test_a_slice_without_messages_is_complete(tmp_path: Path) -> None:
     """A slice without messages is a complete file too."""
     info = SliceWriter(tmp_path / 'bag_0.mcap').close()
     assert indexed(info.path) == in_order(info.path) == []
@@ -154,7 +154,7 @@ def test_an_empty_slice(tmp_path: Path) -> None:
     check(info.path)
 
 
-def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_what_was_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that is full in the middle of a chunk is an OSError, and what was synced before it is recovered."""
     writer = SliceWriter(tmp_path / 'bag_0.mcap')
     written = fill(writer, messages(30))
@@ -187,7 +187,7 @@ def test_an_unknown_compression_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_metadata_among_the_messages(tmp_path: Path) -> None:
+def test_metadata_records_may_be_between_messages(tmp_path: Path) -> None:
     """Other readers list the records and read the messages; so does recovery, of a slice that was not closed."""
     for name in ('closed', 'killed'):
         writer = SliceWriter(tmp_path / f'{name}.mcap', compression='none')

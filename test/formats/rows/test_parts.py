@@ -201,7 +201,7 @@ def test_whatever_is_in_a_file_the_reader_returns(data: st.DataObject) -> None:
     assert all(row['key'].startswith('thor/') for row in found.rows.get('_catalog', ()))
 
 
-def test_a_part_is_one_folders() -> None:
+def test_a_part_belongs_to_one_folder() -> None:
     """Rows of two robots and two days become separate parts, each in the order of time."""
     rows = some(4)
     rows[1] = {**rows[1], 'robot': 'tachi'}
@@ -213,7 +213,7 @@ def test_a_part_is_one_folders() -> None:
     assert all(row is rows[number] for _, _, pairs in found for number, row in pairs)
 
 
-def test_a_robot_needs_no_arrow() -> None:
+def test_a_robot_does_not_need_arrow() -> None:
     """What the node imports to write row files loads none of the libraries that the lake uses."""
     program = (
         'import sys; import shadowhound_data_logger.shipping.catalog_writer;'

@@ -86,7 +86,7 @@ def pose(found: RobotTrack, start: float, end: float | None = None) -> tuple[flo
 
 
 @pytest.mark.parametrize(('rate_hz', 'bar_m', 'bar_rad'), [(50.0, 0.005, 0.04), (10.0, 0.005, 0.04), (5.0, 0.01, 0.2)])
-def test_poses_of_a_patrol(rate_hz: float, bar_m: float, bar_rad: float) -> None:
+def test_poses_are_exact_throughout_a_patrol(rate_hz: float, bar_m: float, bar_rad: float) -> None:
     """All the way round every corner, at any time between two messages, they are the simulator's; the bar is 10 cm."""
     patrol = Patrol.through(FloorPlan.build().patrol)
     count = round(50 * rate_hz)
@@ -115,7 +115,7 @@ def test_the_odometry_may_come_a_little_late() -> None:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_a_node_that_starts_while_the_robot_turns() -> None:
+def test_poses_are_exact_when_the_node_starts_during_a_turn() -> None:
     """What came before the odometry that was heard first has no pose, but for an instant, in which no robot turns by much."""
     patrol = Patrol.through(FloorPlan.build().patrol)
     known = 0
@@ -128,13 +128,13 @@ def test_a_node_that_starts_while_the_robot_turns() -> None:
     assert known
 
 
-def test_a_batch_is_where_its_middle_was() -> None:
+def test_a_batch_has_the_pose_of_its_middle() -> None:
     """Start and end do not matter."""
     found = walking([(t, odometry(t, 0.0, 0.0)) for t in range(11)])
     assert pose(found, 2.0, 8.0) == (5.0, 0.0, 0.0)
 
 
-def test_yaw_turns_the_shorter_way() -> None:
+def test_yaw_is_interpolated_the_shorter_way() -> None:
     """From 179 to -179 degrees by way of 180; no text is a minus zero."""
     found = walking([(0.0, odometry(0, -1e-9, math.radians(179))), (0.1, odometry(0, 0, math.radians(-177)))])
     at = pose(found, 0.05)
@@ -150,7 +150,7 @@ def test_yaw_turns_the_shorter_way() -> None:
         ([1.0, 2.0], 0.9, False), ([1.0, 4.0], 2.5, False), ([1.0, 4.0], 4.0, True), ([1.0, 4.0], 4.1, False),
     ],
 )  # fmt: skip
-def test_what_is_not_known_is_not_made_up(times: list[float], asked: float, known: bool) -> None:
+def test_an_unknown_pose_is_not_invented(times: list[float], asked: float, known: bool) -> None:
     """Before the first message, in a gap and after the last there is no pose; a lone message holds for an instant."""
     assert (pose(walking([(t, odometry(1, 1, 0)) for t in times]), asked) is not None) is known
 
@@ -165,7 +165,7 @@ def test_the_track_is_a_minute_long() -> None:
     assert pose(found, 145.03) == pytest.approx((145.03, 0.0, 0.0), abs=1e-3)
 
 
-def test_a_clock_that_steps_begins_a_new_track() -> None:
+def test_a_clock_step_starts_a_new_track() -> None:
     """After a step back poses are those of after it; a message that is a little late changes nothing."""
     found = walking([(100.0, odometry(1, 0, 0)), (101.0, odometry(1, 0, 0)), (50.0, odometry(5, 0, 0)),
                      (51.0, odometry(5, 0, 0)), (50.5, odometry(9, 0, 0))])  # fmt: skip
@@ -179,7 +179,7 @@ def test_unreadable_odometry_is_skipped(cdr: bytes) -> None:
     assert pose(walking([(0.0, cdr), (0.1, cdr)]), 0.05) is None
 
 
-def test_a_frame_is_one_word() -> None:
+def test_a_frame_id_is_one_word() -> None:
     """Whatever the odometry says, the pose has four words of ASCII; between two frames there is none."""
     said = marked(walking([(t, odometry(1, 2, 0, 'my odöm\n')) for t in (0.0, 0.1)]), 0.05)['pose']
     assert said == '1.000 2.000 0.0000 my_od_m_'
@@ -230,14 +230,14 @@ def fix(latitude: float, longitude: float, altitude: float = 500.0, status: int 
         (2.9, '10.0001000 20.0001000 500.00'), (3.1, None), (-2.1, None),
     ],
 )  # fmt: skip
-def test_the_place_on_earth(t: float, gps: str | None) -> None:
+def test_the_position_on_earth_is_that_of_the_nearest_fixes(t: float, gps: str | None) -> None:
     """That of the fixes around it, or of one at most two seconds away."""
     found = robot()
     take(found, '/fix', FIX, (0.0, fix(10.0, 20.0)), (1.0, fix(10.0001, 20.0001, status=-2)))
     assert marked(found, t).get('gps') == gps
 
 
-def test_across_the_antimeridian_is_no_way_around_earth() -> None:
+def test_positions_are_interpolated_across_the_antimeridian() -> None:
     """Between 179.9999 and -179.9999 lies 180."""
     found = robot()
     take(found, '/fix', FIX, (0.0, fix(0.0, 179.9999)), (1.0, fix(0.0, -179.9999)))
@@ -245,7 +245,7 @@ def test_across_the_antimeridian_is_no_way_around_earth() -> None:
 
 
 @pytest.mark.parametrize('cdr', [b'', fix(1.0, 1.0, status=-1), fix(math.nan, math.nan), fix(95.0, 0.0), fix(0.0, 200.0)])
-def test_what_is_no_fix_is_no_place(cdr: bytes) -> None:
+def test_without_a_fix_there_is_no_position(cdr: bytes) -> None:
     """Without a fix, and for what is no place on Earth."""
     found = robot()
     take(found, '/fix', FIX, (0.0, cdr))
@@ -256,14 +256,14 @@ def test_what_is_no_fix_is_no_place(cdr: bytes) -> None:
     ('published', 'known'),
     [(0.73, '73'), (0.0, '0'), (1.0, '100'), (math.nan, None), (-1.0, None), (73.0, None)],
 )
-def test_the_share_of_a_battery_state_is_percent_here(published: float, known: str | None) -> None:
+def test_the_charge_of_a_battery_state_is_in_percent(published: float, known: str | None) -> None:
     """``BatteryState.percentage`` is 0 to 1 by its definition, and NaN where it is not measured; what is beyond is unknown."""
     found = robot(MissionSettings(battery='battery:percentage'))
     take(found, '/battery', BATTERY_STATE, (0.0, battery_state(published)))
     assert marked(found, 0.0).get('battery_pct') == known
 
 
-def test_other_fields_of_a_battery_state_are_as_they_are() -> None:
+def test_other_fields_of_a_battery_state_are_unchanged() -> None:
     """Volts are volts."""
     found = robot(MissionSettings(battery='battery:voltage'))
     take(found, '/battery', BATTERY_STATE, (0.0, battery_state(0.5)))

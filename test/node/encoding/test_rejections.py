@@ -53,7 +53,7 @@ def test_the_first_rejection_is_logged_immediately_others_each_minute(minute: Mi
     ]  # fmt: skip
 
 
-def test_what_came_after_the_last_report_is_not_forgotten(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
+def test_rejections_after_the_last_report_are_reported(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
     """It is reported when its minute is over, though no more messages come; then there is silence."""
     minute.reject()
     minute.reject()
@@ -88,7 +88,7 @@ def test_every_report_has_a_remedy(minute: Minute, caplog: pytest.LogCaptureFixt
                        'talk.format: cdr stores such messages unchanged)', 'stop it)']  # fmt: skip
 
 
-def test_what_is_known_already_waits(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
+def test_known_rejections_wait_for_the_next_report(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
     """What somebody else reported is not reported again before a minute is over."""
     minute.log.add('/odom', '', [Rejection('wrong_type', '', 'wrong_type: it is a String', 5)], is_known=True)
     assert not caplog.records
@@ -96,7 +96,7 @@ def test_what_is_known_already_waits(minute: Minute, caplog: pytest.LogCaptureFi
     assert caplog.records[0].getMessage().startswith('/odom: 5 more messages in 60 s cannot be stored: wrong_type')
 
 
-def test_names_without_end(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unbounded_number_of_names_is_summarized(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
     """Whoever invents topics and publishers costs no more memory than a thousand of them."""
     caplog.set_level(logging.CRITICAL)
     for number in range(3 * MAX_KNOWN):

@@ -80,12 +80,12 @@ def walking(robot: Robot, seconds: float = 2.0) -> Robot:
     return robot
 
 
-def test_in_the_map() -> None:
+def test_a_pose_is_in_the_map() -> None:
     """Odometry and localization are joined: 1.5 m ahead in odometry is 1.5 m to the left of the origin of the map."""
     assert walking(Robot()).pose(1.5) == (10.0, 21.5, round(math.pi / 2, 4), 'map')
 
 
-def test_between_two_transforms() -> None:
+def test_poses_are_interpolated_between_transforms() -> None:
     """It is interpolated, and extrapolated for a moment; then it is unknown."""
     robot = walking(Robot())
     assert robot.pose(1.026) == (10.0, 21.026, 1.5708, 'map')
@@ -94,7 +94,7 @@ def test_between_two_transforms() -> None:
     assert robot.pose(-0.5) is None
 
 
-def test_the_map_counts_before_odometry() -> None:
+def test_the_map_takes_precedence_over_odometry() -> None:
     """And odometry before tf without a map."""
     robot = walking(Robot())
     robot.take('/odom', ODOMETRY, 1.0, odometry(7.0, 7.0, 0.0))
@@ -115,7 +115,7 @@ def test_an_outdated_map_is_not_used() -> None:
     assert robot.pose(8.0) == (8.0, 0.0, 0.0, 'odom')
 
 
-def test_several_robots_in_one_tree() -> None:
+def test_robots_in_one_tree_are_kept_apart() -> None:
     """Each has its own frames, by the name of its namespace."""
     for name, x in (('robot0', 1.0), ('robot1', 2.0)):
         robot = Robot(name)
@@ -125,7 +125,7 @@ def test_several_robots_in_one_tree() -> None:
         assert robot.pose(0.0) == (x, 0.0, 0.0, 'map')
 
 
-def test_frames_of_one_publisher_in_turn() -> None:
+def test_transforms_sent_one_by_one_are_all_kept() -> None:
     """A publisher that sends each transform in a message of its own: none of them is lost among those that are kept."""
     robot = Robot()
     for number in range(100):
@@ -142,7 +142,7 @@ def test_frames_of_one_publisher_in_turn() -> None:
         (Frame('world', 'base_link', 1.0),), (Frame('odom', 'wheel', 1.0),), (Frame('odom', 'base_link', math.nan),),
     ],
 )  # fmt: skip
-def test_what_has_no_place(frames: tuple[Frame, ...]) -> None:
+def test_frames_without_a_transform_have_no_pose(frames: tuple[Frame, ...]) -> None:
     """Trees without a map and odometry, trees that are none, and numbers that are none."""
     robot = Robot()
     robot.send(0.0, *frames)
@@ -150,7 +150,7 @@ def test_what_has_no_place(frames: tuple[Frame, ...]) -> None:
 
 
 @pytest.mark.parametrize('cdr', [b'', b'\0\1\0\0', b'\0\1\0\0' + b'\xff' * 40, tf(Frame('odom', 'base_link'))[:50], b'\0\7' * 30])
-def test_hostile_messages(cdr: bytes) -> None:
+def test_hostile_transforms_are_ignored(cdr: bytes) -> None:
     """They are no transforms, and those of others are found."""
     robot = walking(Robot())
     robot.take('/tf', TRANSFORMS, 1.0, cdr)

@@ -32,7 +32,7 @@ def network(*, has_range: bool = True, **environ: str) -> Network:
     return robot_network(environ, 5, has_range=has_range)
 
 
-def test_by_default_all_interfaces_and_multicast() -> None:
+def test_by_default_all_interfaces_and_multicast_are_used() -> None:
     """Then Fast DDS finds everybody by its own means."""
     found = network()
     assert found == Network()
@@ -48,7 +48,7 @@ def test_localhost_only_is_the_loopback_interface_on_humble() -> None:
 
 
 @pytest.mark.parametrize('environ', [{'ROS_LOCALHOST_ONLY': '1'}, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}])
-def test_localhost_is_no_multicast_later(environ: dict[str, str]) -> None:
+def test_localhost_uses_no_multicast_after_humble(environ: dict[str, str]) -> None:
     """All addresses of this machine are told, and where the range asks for peers those too."""
     found = network(**environ, ROS_STATIC_PEERS='10.0.0.9:7777')
     assert (found.interfaces, found.multicast) == ((), False)
@@ -56,7 +56,7 @@ def test_localhost_is_no_multicast_later(environ: dict[str, str]) -> None:
     assert announced_to(found, 5) == expected + ([] if 'ROS_LOCALHOST_ONLY' in environ else [('10.0.0.9', 7777)])
 
 
-def test_other_ranges() -> None:
+def test_every_discovery_range_is_translated() -> None:
     """OFF finds nobody; SYSTEM_DEFAULT knows no static peers, SUBNET has them beside multicast."""
     assert network(ROS_AUTOMATIC_DISCOVERY_RANGE='OFF').is_off
     assert network(ROS_AUTOMATIC_DISCOVERY_RANGE='SYSTEM_DEFAULT', ROS_STATIC_PEERS='10.0.0.9') == Network()
@@ -80,19 +80,19 @@ def test_other_ranges() -> None:
         (general('<Interfaces><NetworkInterface name="eth0"/></Interfaces>', ' id="5"'), ('10.0.0.2',)),
     ],
 )
-def test_interfaces_of_cyclone(uri: str, interfaces: tuple[str, ...]) -> None:
+def test_interfaces_of_cyclone_dds_are_used(uri: str, interfaces: tuple[str, ...]) -> None:
     """By name or address, in the old and the new words, of the domain that is ours."""
     assert network(CYCLONEDDS_URI=uri).interfaces == interfaces
 
 
-def test_an_interface_that_is_not_there() -> None:
+def test_a_missing_interface_is_reported() -> None:
     """It is a problem that has a name: a white list of nothing would hear nobody."""
     found = network(CYCLONEDDS_URI=general('<Interfaces><NetworkInterface name="eth7"/></Interfaces>'))
     assert found.interfaces == ()
     assert 'eth7' in found.problem
 
 
-def test_peers_of_cyclone(tmp_path: Path) -> None:
+def test_peers_of_cyclone_dds_are_used(tmp_path: Path) -> None:
     """From a file and from the variable itself, one after the other."""
     file = tmp_path / 'cyclone.xml'
     file.write_text(discovery('<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>40</MaxAutoParticipantIndex>'
@@ -110,7 +110,7 @@ def test_peers_of_cyclone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('words', 'multicast'), [('true', True), ('spdp', True), ('asm, spdp', True), ('false', False), ('default', True)]
 )
-def test_multicast_of_cyclone(words: str, multicast: bool) -> None:
+def test_multicast_settings_of_cyclone_dds_are_used(words: str, multicast: bool) -> None:
     """Whether participants are found by it."""
     assert network(CYCLONEDDS_URI=general(f'<AllowMulticast>{words}</AllowMulticast>')).multicast is multicast
 
@@ -124,12 +124,12 @@ def test_multicast_of_cyclone(words: str, multicast: bool) -> None:
         general('<UseIPv6>true</UseIPv6>'), general('<ExternalNetworkAddress>1.2.3.4</ExternalNetworkAddress>'),
     ],
 )  # fmt: skip
-def test_what_fast_dds_has_no_word_for(uri: str) -> None:
+def test_settings_that_fast_dds_lacks_are_reported(uri: str) -> None:
     """Somebody who listens through Fast DDS would find others there, or nobody: it is told."""
     assert 'CYCLONEDDS_URI' in network(CYCLONEDDS_URI=uri).problem
 
 
-def test_what_changes_nothing_is_no_problem() -> None:
+def test_settings_without_effect_are_not_reported() -> None:
     """The same elements with their defaults."""
     uri = discovery('<Tag></Tag><ExternalDomainId>default</ExternalDomainId>') + general('<Transport>default</Transport>')
     assert network(CYCLONEDDS_URI=uri) == Network()
@@ -142,7 +142,7 @@ def parsed(text: str) -> ET.Element:
     return root
 
 
-def test_the_profile() -> None:
+def test_the_profile_has_buffer_interfaces_and_peers() -> None:
     """Buffer, interfaces and peers stand where Fast DDS reads them; shared memory only where it has a size."""
     root = parsed(profile(4 << 20, Network(interfaces=('10.0.0.2',), multicast=False), 5))
     assert [each.text for each in root.iter('type')] == ['UDPv4']
@@ -159,7 +159,7 @@ def test_the_profile() -> None:
     assert root.find('.//interfaceWhiteList') is None
 
 
-def test_the_addresses_of_this_machine() -> None:
+def test_the_addresses_of_this_machine_can_be_bound() -> None:
     """As the kernel has them: each can be bound."""
     found = addresses()
     assert ('lo', '127.0.0.1') in found

@@ -98,7 +98,7 @@ def test_messages_that_arrive_before_the_intake_exists_are_kept_once(start: Star
     assert start.kept('/a') == texts
 
 
-def test_a_subscription_that_is_not_needed_ends(start: Start) -> None:
+def test_an_unneeded_early_subscription_ends(start: Start) -> None:
     """It belongs to a sensor that is off now, or whose topic has another type than the settings named."""
     a, b = start.sensor('a'), start.sensor('b')
     start.robot.create(Int32, '/a')
@@ -110,7 +110,7 @@ def test_a_subscription_that_is_not_needed_ends(start: Start) -> None:
     assert early.adopt('/b', STRING) == []
 
 
-def test_what_cannot_be_subscribed_to_is_left_to_the_intake(start: Start) -> None:
+def test_topics_that_cannot_be_subscribed_to_early_are_left_to_the_intake(start: Start) -> None:
     """A type that is not installed, several possible types, or none, raise nothing and make no subscription."""
     sensors = [
         start.sensor('a', ('no_such_package/msg/X',)),

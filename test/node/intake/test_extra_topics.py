@@ -90,7 +90,7 @@ def crowd(robot: Node, *names: str) -> list[Any]:
     return [robot.create_publisher(String, name, 1) for name in names]
 
 
-def test_topics_that_no_setting_names_are_few(
+def test_unconfigured_topics_are_limited(
     robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Beyond the bound a topic is left out, which is told once and counted; one that is named has its place whatever there is."""
@@ -120,7 +120,7 @@ def test_an_abandoned_topic_frees_its_place(robot: Node, recording: Recording, m
     assert [source.topic for source in recording.extra.own] == ['/named', '/crowd/b']
 
 
-def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_topics_that_come_and_go_are_limited(robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     """The middleware keeps a little of each name: who makes new ones for ever is not followed for ever."""
     monkeypatch.setattr(module, 'MAX_EVER', 2)
     for name in ('/crowd/a', '/crowd/b', '/crowd/c'):
@@ -144,7 +144,9 @@ def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monke
     ((), '^/imu$', '', ('/imu',)), ((), 'nothing', '', ()), ((), '/_hidden$', '', ('/_hidden',)),
     ((), '.*|/_', 'imu|odom|raw|rosout', ('/_hidden', '/a/_hidden/b')),
 ])  # fmt: skip
-def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]) -> None:
+def test_topics_are_selected_by_name_and_pattern(
+    named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]
+) -> None:
     """Those that are named, or match and are neither excluded nor hidden (unless the regex has /_); otherwise the sensors'."""
     choice = TopicChoice(BagSettings(regex=regex, exclude=exclude), named)
     assert choice.needs_graph is bool(regex)
@@ -154,6 +156,6 @@ def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: 
 @pytest.mark.parametrize(
     'name', ['/%s%n', '/1digit', '//double', '/{curly}~', '/a b', '/a\x1b]0;owned\x07', '/ä', 'relative', '/a' * 150]
 )
-def test_names_that_are_invalid_in_ros(name: str) -> None:
+def test_names_that_are_invalid_in_ros_are_ignored(name: str) -> None:
     """A program without ROS may have any; an expression that matches it takes the other topics."""
     assert TopicChoice(BagSettings(regex='.*'), ()).wanted((), [name, '/good']) == {'/good'}

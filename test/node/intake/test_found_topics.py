@@ -20,6 +20,6 @@ ROBOT = ('odom', 'imu', 'camera/image_raw')
         (['/mavros/imu', '/front/camera/image_raw', '/odom', '/x'], '/', []),
     ],
 )
-def test_namespaces_of_robots(topics: list[str], own: str, robots: list[str]) -> None:
+def test_namespaces_of_robots_are_found(topics: list[str], own: str, robots: list[str]) -> None:
     """Those with three topics or more that have the names of the default sensors; not those of parts of a robot."""
     assert robots_in(topics, own) == robots

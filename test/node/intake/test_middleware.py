@@ -39,7 +39,7 @@ def prefix(folder: Path, versions: dict[str, str]) -> dict[str, str]:
     return {'AMENT_PREFIX_PATH': f'/nowhere:{folder}'}
 
 
-def test_a_cyclone_robot_is_heard_through_fast_dds(installed: dict[str, str]) -> None:
+def test_a_robot_with_cyclone_dds_is_received_through_fast_dds(installed: dict[str, str]) -> None:
     """With the profile in place of the variables that Fast DDS reads in another way than Cyclone DDS."""
     robot = {**installed, **CYCLONE, 'ROS_LOCALHOST_ONLY': '1', 'ROS_STATIC_PEERS': '10.0.0.9'}
     found = choose('auto', robot)
@@ -125,7 +125,7 @@ def test_the_first_prefix_counts(tmp_path: Path) -> None:
         (KILTED, {**CYCLONE, 'CYCLONEDDS_URI': '<Discovery><Tag>x</Tag></Discovery>'}, 'Discovery/Tag'),
     ],
 )  # fmt: skip
-def test_where_it_is_not_as_good_the_robots_own_is_taken(
+def test_the_robots_rmw_is_kept_where_fast_dds_would_be_worse(
     tmp_path: Path, versions: dict[str, str], variables: dict[str, str], why: str
 ) -> None:
     """With the reason, which stands in the first line; nothing of the environment changes."""
@@ -147,7 +147,7 @@ def test_a_requested_rmw_is_used_or_rejected(installed: dict[str, str], tmp_path
             choose('fastrtps', environ)
 
 
-def test_what_cannot_be_read_yet_is_left_to_ros(tmp_path: Path) -> None:
+def test_unreadable_settings_are_left_to_ros(tmp_path: Path) -> None:
     """Who starts the node is told by rcl, as ever, what is wrong with a file."""
     assert requested_rmw(['--ros-args', '--params-file', str(tmp_path / 'none.yaml')]) == 'auto'
     assert requested_rmw(['--ros-args', '-p', 'capture.rmw:=robot']) == 'robot'

@@ -1,4 +1,9 @@
-"""What is sampled and batched when the clocks of a topic's publishers differ, or their stamps cannot be trusted."""
+"""What is sampled and batched when the clocks of a topic's publishers differ, or their stamps cannot be trusted.
+
+Batches are whole windows of UTC, bounded in time, number and size.
+
+Downsampling: which messages of a topic are kept.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +12,27 @@ import struct
 from collections.abc import Iterable
 from itertools import accumulate
 
+import pytest
 from clocks import NOON_NS
 from node.intake.test_stream import Batches
 
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
-from shadowhound_data_logger.core.config import SensorSettings
-from shadowhound_data_logger.core.model import Batch, Taken
+from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
+from shadowhound_data_logger.core.model import Batch, Sample, Taken
 from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.formats.types import MessageTypes
-from shadowhound_data_logger.node.intake.sampling import Sampler
+from shadowhound_data_logger.node.encoding.encode_pool import MAX_MESSAGES
+from shadowhound_data_logger.node.intake.sampling import (
+    MAX_ARCHIVE_BYTES,
+    MAX_BATCH_BYTES,
+    MAX_BATCH_MESSAGES,
+    Batcher,
+    EveryMessage,
+    FirstOfPeriod,
+    OnChange,
+    Sampler,
+    rule_for,
+)
 from shadowhound_data_logger.node.intake.stream import Senders, SensorStream
 from shadowhound_data_logger.spool.accounts import Accounts
 
@@ -98,10 +115,179 @@ def test_erratic_stamps_do_not_end_batches() -> None:
     assert len(found) <= SECONDS + 6
 
 
-def test_a_clock_that_is_set_starts_one_batch() -> None:
+def test_setting_the_clock_starts_one_batch() -> None:
     """Not one for each message that follows."""
     half = HZ * SECONDS // 2
     for step in (-40, 40):
         found = batches(received('a', [0] * half + [step * SECOND] * half), batch_s=1.0)
         assert len(found) <= SECONDS + 4
         assert sum(len(batch.samples) for batch in found) == 2 * half
+
+
+def batcher(batch_s: float = 1.0, format_name: str = 'json') -> Batcher:
+    sensor = SensorSettings(name='imu', batch_s=batch_s, format=format_name)
+    return Batcher(sensor, '/imu', 'sensor_msgs/msg/Imu')
+
+
+def stamps(batch: Batch) -> list[int]:
+    return [sample.stamp_ns for sample in batch.samples]
+
+
+def test_a_batch_is_a_window_of_utc() -> None:
+    """A message of the next whole second closes the batch of this one."""
+    open_batch = batcher()
+    closed = [batch for stamp in (0, 1, SECOND - 1, SECOND, 3 * SECOND) for batch in open_batch.add(Sample(stamp, b'x'), 0.0)]
+    assert [stamps(batch) for batch in closed] == [[0, 1, SECOND - 1], [SECOND]]
+    assert stamps(open_batch.close()) == [3 * SECOND]
+    assert not len(open_batch)
+
+
+def test_a_batch_has_sensor_topic_and_type() -> None:
+    """Sensor, topic, type and the bytes of CDR stand on it."""
+    open_batch = batcher()
+    open_batch.add(Sample(1, b'12345'), 0.0)
+    open_batch.add(Sample(2, b'123'), 0.0)
+    assert len(open_batch) == 2
+    assert open_batch.close() == Batch('imu', '/imu', 'sensor_msgs/msg/Imu', (Sample(1, b'12345'), Sample(2, b'123')), 8)
+
+
+def test_without_a_window_each_message_is_a_batch() -> None:
+    """With 0 nothing is ever open."""
+    open_batch = batcher(batch_s=0.0)
+    assert [stamps(batch) for batch in open_batch.add(Sample(7, b''), 0.0)] == [[7]]
+    assert not len(open_batch)
+
+
+@pytest.mark.parametrize(('format_name', 'most'), [('json', MAX_BATCH_BYTES), ('tar', MAX_ARCHIVE_BYTES)])
+def test_a_large_batch_is_closed_early(format_name: str, most: int) -> None:
+    """Memory is bounded whatever a topic sends, to what a format makes of it; a message that ends two batches closes both."""
+    open_batch = batcher(format_name=format_name)
+    assert open_batch.add(Sample(0, bytes(most - 1)), 0.0) == []
+    large = Sample(SECOND, bytes(most))
+    assert [stamps(batch) for batch in open_batch.add(large, 0.0)] == [[0], [SECOND]]
+    assert not len(open_batch)
+
+
+def test_many_small_messages_are_closed_early() -> None:
+    """However small its messages, a batch always fits into the queue that it has to pass."""
+    open_batch = batcher(batch_s=3600.0)
+    closed = [batch for stamp in range(MAX_BATCH_MESSAGES) for batch in open_batch.add(Sample(stamp, b''), 0.0)]
+    assert [len(batch.samples) for batch in closed] == [MAX_BATCH_MESSAGES]
+    assert MAX_MESSAGES >= 4 * MAX_BATCH_MESSAGES
+    assert QueueSettings().max_bytes >= 4 * MAX_ARCHIVE_BYTES
+
+
+def test_a_batch_is_due_when_its_time_is_over() -> None:
+    """A topic that falls silent does not keep its batch open; an empty one is never due."""
+    open_batch = batcher()
+    assert not open_batch.is_due(100.0, 0.1)
+    open_batch.add(Sample(0, b''), 10.0)
+    assert not open_batch.is_due(11.05, 0.1)
+    assert open_batch.is_due(11.15, 0.1)
+
+
+def test_a_clock_that_steps_back_ends_the_batch() -> None:
+    """Samples from before the clock was set do not share an object with those from after it."""
+    open_batch = batcher()
+    open_batch.add(Sample(50 * SECOND, b''), 0.0)
+    assert [stamps(batch) for batch in open_batch.add(Sample(20 * SECOND, b''), 0.0)] == [[50 * SECOND]]
+
+
+def test_a_late_sample_joins_the_open_batch() -> None:
+    """Two publishers whose clocks differ by a second and a half do not make an object of each message."""
+    open_batch = batcher()
+    open_batch.add(Sample(5 * SECOND, b''), 0.0)
+    assert open_batch.add(Sample(3 * SECOND + SECOND // 2, b''), 0.0) == []
+    assert stamps(open_batch.close()) == [5 * SECOND, 3 * SECOND + SECOND // 2]
+
+
+@pytest.mark.parametrize('batch_s', [1.0, 3600.0])
+@pytest.mark.parametrize('first', ['boot clock', 'UTC'])
+def test_a_batch_ends_where_the_clock_is_set(batch_s: float, first: str) -> None:
+    """No object holds times of the boot clock and of UTC, in whichever direction the clock is set."""
+    noon_ns = 1_760_788_800 * SECOND
+    order = [60 * SECOND, noon_ns] if first == 'boot clock' else [noon_ns, 60 * SECOND]
+    open_batch = batcher(batch_s)
+    closed = [batch for stamp in order for batch in open_batch.add(Sample(stamp, b'x'), 0.0)]
+    assert [stamps(batch) for batch in (*closed, open_batch.close())] == [[stamp] for stamp in order]
+
+
+def kept(gate: FirstOfPeriod, *stamps_ns: int) -> list[int]:
+    return [stamp for stamp in stamps_ns if gate.selects(stamp, b'')]
+
+
+def test_the_first_message_of_each_second_is_kept() -> None:
+    """Periods are those of UTC, whenever the messages began."""
+    stamps = [NOON_NS + round(number * SECOND / 30) for number in range(-5, 91)]
+    firsts = {stamp // SECOND: stamp for stamp in reversed(stamps)}
+    assert kept(FirstOfPeriod(SECOND), *stamps) == sorted(firsts.values())
+
+
+def test_a_restart_keeps_nothing_of_a_period_twice() -> None:
+    """What was kept before is known by the stamp of the newest durable sample."""
+    gate = FirstOfPeriod(SECOND, NOON_NS + 100)
+    assert kept(gate, NOON_NS + 200, NOON_NS + SECOND - 1, NOON_NS + SECOND) == [NOON_NS + SECOND]
+
+
+def test_messages_out_of_order_are_not_kept_twice() -> None:
+    """A late message of a period that had its own is skipped."""
+    assert kept(FirstOfPeriod(SECOND), NOON_NS, NOON_NS + SECOND, NOON_NS + 5, NOON_NS + SECOND + 1) == [
+        NOON_NS,
+        NOON_NS + SECOND,
+    ]
+
+
+def test_setting_the_clock_back_does_not_stop_the_sampling() -> None:
+    """Stamps an hour back are a clock that was set: it goes on from there."""
+    hour = 3600 * SECOND
+    assert kept(FirstOfPeriod(SECOND), NOON_NS, NOON_NS - hour, NOON_NS - hour + SECOND) == [
+        NOON_NS,
+        NOON_NS - hour,
+        NOON_NS - hour + SECOND,
+    ]
+
+
+@pytest.mark.parametrize('has_header', [True, False])
+def test_a_message_is_kept_when_its_content_changes(*, has_header: bool) -> None:
+    """The stamp of a header is not content; where there is no header those bytes are."""
+    gate = OnChange(has_header=has_header)
+    cdr = b'\x00\x01\x00\x00' + b'STAMPSTA' + b'content'
+    assert gate.selects(0, cdr)
+    assert not gate.selects(0, cdr)
+    assert gate.selects(0, cdr.replace(b'STAMP', b'stamp')) is not has_header
+    assert gate.selects(0, cdr.replace(b'content', b'changed'))
+    assert gate.selects(0, cdr), 'what comes back is a change as well'
+
+
+def test_a_latched_message_is_kept_once() -> None:
+    """What is sent again to a node that was restarted has the stamp of the newest durable sample; another content is new."""
+    gate = OnChange(has_header=False, last_stored_ns=7 * SECOND)
+    assert [gate.selects(stamp * SECOND, content) for stamp, content in ((7, b'0000a'), (8, b'0000a'), (9, b'0000b'))] == [
+        False, False, True,
+    ]  # fmt: skip
+    assert OnChange(has_header=False, last_stored_ns=7 * SECOND).selects(8 * SECOND, b'0000a')
+
+
+def test_the_settings_choose_the_rule() -> None:
+    """0 Hz keeps every message, on_change goes before the rate."""
+
+    def gate(**settings: object) -> object:
+        return rule_for(SensorSettings(name='x', **settings), has_header=True, last_stored_ns=0)  # type: ignore[arg-type]
+
+    assert isinstance(gate(rate_hz=0.0), EveryMessage)
+    assert isinstance(gate(rate_hz=2.0), FirstOfPeriod)
+    assert isinstance(gate(rate_hz=2.0, on_change=True), OnChange)
+    assert EveryMessage().selects(0, b'')
+
+
+def test_the_rate_is_the_period() -> None:
+    """At 4 Hz four messages a second are kept."""
+    gate = rule_for(SensorSettings(name='x', rate_hz=4.0), has_header=True, last_stored_ns=0)
+    assert sum(gate.selects(NOON_NS + number * SECOND // 100, b'') for number in range(300)) == 12
+
+
+def test_setting_the_clock_does_not_stop_the_sampling() -> None:
+    """From seconds since boot to UTC and back, each period has its message and none has two."""
+    up = 60 * SECOND
+    stamps = [up, up + 1, up + SECOND, NOON_NS, NOON_NS + 1, NOON_NS + SECOND, up + 5 * SECOND, up + 6 * SECOND]
+    assert kept(FirstOfPeriod(SECOND, NOON_NS - 3600 * SECOND), *stamps) == [up, up + SECOND, *stamps[3:4], *stamps[5:]]

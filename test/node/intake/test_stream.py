@@ -103,7 +103,7 @@ class Commits(Consumer):
 @pytest.mark.parametrize(('given', 'settings', 'still_open'), [
     ({'idle': True}, {}, 0), ({'paused': True}, {}, 0), ({}, {'rate_hz': 1.0}, 4), ({}, {}, 30),
 ])  # fmt: skip
-def test_what_is_skipped_is_at_no_time_open(given: dict[str, bool], settings: dict[str, float], still_open: int) -> None:
+def test_skipped_messages_are_never_open(given: dict[str, bool], settings: dict[str, float], still_open: int) -> None:
     """A commit at any moment and a kill right then: the next start counts nothing as lost that was to be left out."""
     talk = Talk(**settings)
     commits = Commits(talk.accounts)
@@ -151,7 +151,7 @@ def test_another_rate_keeps_nothing_of_a_period_twice(rate_hz: float, kept: list
     assert talk.kept() == kept
 
 
-def test_what_was_kept_before_the_stream_began_is_not_kept_again() -> None:
+def test_messages_kept_before_a_restart_are_not_kept_again() -> None:
     """A stream that begins anew within a period (a sensor that is switched off and on) waits for the next one."""
     talk = Talk(rate_hz=1.0, last_stored_ns=NOON_NS + 1)
     talk.add(talk.messages(12))
@@ -162,7 +162,7 @@ def test_what_was_kept_before_the_stream_began_is_not_kept_again() -> None:
     assert talk.kept() == [10, 20]
 
 
-def test_other_settings_do_not_repeat_what_has_not_changed() -> None:
+def test_changed_settings_do_not_repeat_unchanged_messages() -> None:
     """A sensor that keeps changes remembers the last one through a change of its settings."""
     talk = Talk(on_change=True)
     talk.add(talk.messages(2, cdr=b'0000same'))
@@ -182,7 +182,7 @@ def spoken(talk: Talk, how_many: int, **fields: object) -> None:
         talk.stream.poll(taken[0].source_ns / SECOND)
 
 
-def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:
+def test_without_numbers_and_rhythm_losses_are_unknown() -> None:
     """What is not known is None, never 0."""
     talk = Talk()
     talk.senders.poll(['a'])
@@ -191,7 +191,7 @@ def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:
     assert (account.accounting, account.missed, account.missed_estimated, account.unknown) == (RECEIVED_ONLY, None, None, 3)
 
 
-def test_a_rhythm_counts_what_is_lost() -> None:
+def test_losses_are_counted_from_the_rhythm() -> None:
     """Once it is known, also what was lost before."""
     talk = Talk()
     talk.senders.poll(['a'])
@@ -232,7 +232,7 @@ def test_an_unreadable_counter_is_reported(caplog: pytest.LogCaptureFixture) -> 
     assert 'talk.counter cannot be used' in caplog.text
 
 
-def test_what_another_publisher_did_not_publish_is_not_lost() -> None:
+def test_messages_of_another_publisher_are_not_lost() -> None:
     """Between one publisher and the next there is no loss; between one that went away and came back there is."""
     for successor, lost in (('b', 0), ('a', 50)):
         talk = Talk(expected_hz=10.0)
@@ -262,7 +262,7 @@ def test_a_second_sender_leaves_the_numbers_of_the_first_alone() -> None:
     assert sum(span.published for span in account.publishers.values()) == 6
 
 
-def test_what_two_subscriptions_deliver_is_counted_once() -> None:
+def test_messages_delivered_by_two_subscriptions_are_counted_once() -> None:
     """A repeat is known by its number, or by time and content where it has none."""
     for fields in ({}, UNNUMBERED):
         talk = Talk()
@@ -273,7 +273,7 @@ def test_what_two_subscriptions_deliver_is_counted_once() -> None:
         assert talk.kept() == [1, 2, 3]
 
 
-def test_a_history_that_comes_again_when_a_second_sender_appears() -> None:
+def test_a_history_delivered_again_is_counted_once() -> None:
     """What was taken while one sender was known is known again by its time and number, though nobody can say whose it is."""
     talk = Talk()
     talk.senders.poll(['a'])
@@ -311,7 +311,7 @@ class Broken(Consumer):
 
 
 @pytest.mark.parametrize(('where', 'said'), [('choose', 'ValueError: a defect'), ('take', "KeyError: '/talk'")])
-def test_a_consumer_that_raises_keeps_no_other_from_its_messages(where: str, said: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_consumer_does_not_affect_the_others(where: str, said: str, caplog: pytest.LogCaptureFixture) -> None:
     """Those before it and after it get every drain; it is counted, and named in the log, not each time."""
     talk, broken, last = Talk(), Broken(where), Drains()
     talk.listen(broken, talk.sampler, last)
@@ -339,7 +339,7 @@ def test_messages_of_a_failing_sampler_are_dropped(monkeypatch: pytest.MonkeyPat
     assert (last.sizes, talk.sampler.failures) == ([2, 3, 1], 1)
 
 
-def test_a_topic_of_no_sensor_goes_to_the_others_too() -> None:
+def test_a_topic_without_a_sensor_reaches_the_other_consumers() -> None:
     """As above, where the consumers themselves asked for it."""
     broken, other = Broken('take'), Drains()
     other.topics = frozenset({TOPIC})
@@ -347,7 +347,7 @@ def test_a_topic_of_no_sensor_goes_to_the_others_too() -> None:
     assert (other.sizes, broken.failures) == ([4], 1)
 
 
-def test_the_journal_is_complete_up_to_what_has_an_outcome() -> None:
+def test_the_watermark_ends_before_open_messages() -> None:
     """A message that is kept may still be lost while it is in the open batch, in the queue or in an encoder."""
     talk = Talk(batch_s=1.0)
     queue = talk.sampler._queue = BatchQueue(QueueSettings())

@@ -92,7 +92,7 @@ def test_without_reports_nothing_is_known() -> None:
     assert robot.texts is None
 
 
-def test_only_what_would_be_logged_counts() -> None:
+def test_only_topics_that_would_be_logged_count() -> None:
     """Of the topics of sensors that are enabled now, and of the type that is named for them; where none is, of any."""
     robot = Robot(imu=IMU, odom='')
     robot.theirs = {
@@ -124,7 +124,7 @@ def test_the_front_learns_the_known_publishers() -> None:
 @pytest.mark.parametrize(('count', 'words'), [
     (2, 'finds 2 publishers that'), (MAX_PUBLISHERS, f'finds {MAX_PUBLISHERS} or more publishers'),
 ])  # fmt: skip
-def test_several_are_one_error(count: int, words: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_several_undiscovered_publishers_are_one_error(count: int, words: str, caplog: pytest.LogCaptureFixture) -> None:
     """A report has no more of them than a limit, so the words claim no number then."""
     robot = Robot(imu=IMU)
     robot.theirs = {'/imu': [[f'{number}', IMU, ''] for number in range(count)]}

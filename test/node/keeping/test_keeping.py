@@ -61,7 +61,7 @@ def test_a_preview_is_small_and_names_its_original(body: bytes, content_type: st
     assert found.metadata == {meta.ROBOT: 'thor', meta.POSE: '1 2 0 odom', meta.PREVIEW_OF: kept.key}
 
 
-def test_a_preview_a_second() -> None:
+def test_one_preview_is_kept_per_second() -> None:
     """The first of each; of none where they are not wanted, nor of what is sent anyway."""
     keeper, body = keeping(), picture()
     made = [keeper.preview(keeper.mark(frame(body, after_s=number / 5))) for number in range(10)]

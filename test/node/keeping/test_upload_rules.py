@@ -42,11 +42,11 @@ def interfaces(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_networks_of_all_interfaces_with_a_radio(interfaces: Path) -> None:
+def test_networks_of_all_wireless_interfaces_are_known(interfaces: Path) -> None:
     assert wifi_networks(interfaces, Kernel({'wlan0': b'lab', 'wlan1': 'Café'.encode()})) == {'lab', 'Café'}
 
 
-def test_no_network(interfaces: Path, tmp_path: Path) -> None:
+def test_without_a_network_the_value_is_false(interfaces: Path, tmp_path: Path) -> None:
     assert wifi_networks(interfaces, Kernel({'wlan0': b'', 'wlan1': b''})) == set()
     (tmp_path / 'none').mkdir()
     assert wifi_networks(tmp_path / 'none') == set()
@@ -60,7 +60,7 @@ def test_an_unknown_network_has_a_reason(interfaces: Path) -> None:
     assert isinstance(wifi_networks(interfaces / 'nowhere'), str)
 
 
-def test_networks_of_this_machine() -> None:
+def test_networks_of_this_machine_are_read() -> None:
     assert wifi_networks() is not None
 
 

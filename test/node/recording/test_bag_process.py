@@ -28,7 +28,7 @@ def _manifest(bag: str, state: str = COMPLETE, clock: ClockOf | None = None) -> 
     return Manifest(bag, 'thor', None, state, (), (), (), clock=clock)
 
 
-def test_an_older_bag_is_not_taken_for_ours(tmp_path: Path) -> None:
+def test_an_older_bag_is_not_mistaken_for_the_new_one(tmp_path: Path) -> None:
     """What an earlier process left is made whole meanwhile, before our bag ends or after it."""
     ours, older = _manifest('patrol_20251018_120000'), _manifest('patrol_20251018_110000', RECOVERED)
     assert _writer(tmp_path, older, ours).manifest_of(ours.bag) == ours

@@ -106,7 +106,7 @@ def ear(request: pytest.FixtureRequest) -> Ear:
     return Ear(own=request.param)
 
 
-def test_everything_is_handed_on_once(ear: Ear) -> None:
+def test_every_message_is_passed_on_once(ear: Ear) -> None:
     """In the order of arrival, also what came twice by two subscriptions; a gap is missed, as for the sensors."""
     ear.add(messages(1, 2, 3))
     ear.add(messages(3, 4, 7))
@@ -146,7 +146,7 @@ def test_a_pause_counts_and_drops(ear: Ear) -> None:
     assert (ear.account.received, ear.account.dropped) == (4, {'paused': 3})
 
 
-def test_what_the_sensor_keeps_does_not_change() -> None:
+def test_recording_does_not_change_what_the_sensor_keeps() -> None:
     """Sampling, and outside of a mission nothing, while the bag gets all of it."""
     ear = Ear(own=False)
     ear.add(messages(*range(1, 151)))
@@ -177,7 +177,7 @@ def test_a_full_queue_drops_the_newest() -> None:
     assert ear.heard() == [6]
 
 
-def test_what_is_latched_is_in_each_bag() -> None:
+def test_latched_messages_are_in_each_bag() -> None:
     """A second recording gets what is delivered again, once; nothing of it counts as missed."""
     ear = Ear(own=True)
     ear.add(messages(1, 2))
@@ -193,7 +193,7 @@ def test_what_is_latched_is_in_each_bag() -> None:
 @pytest.mark.parametrize(
     ('durability', 'lifespan_ns', 'latched'), [(1, 0, 1), (1, (1 << 63) - 1, 1), (1, 10 * 10**9, 0), (2, 0, 0)]
 )
-def test_what_is_latched_is_marked(durability: int, lifespan_ns: int, latched: int) -> None:
+def test_latched_messages_are_marked(durability: int, lifespan_ns: int, latched: int) -> None:
     """A publisher that is TRANSIENT_LOCAL counts, unless its messages expire, as those of ``/rosout`` do."""
     ear = Ear(own=True, graph=Graph(durability, lifespan_ns))
     for number in range(3):
@@ -204,7 +204,7 @@ def test_what_is_latched_is_marked(durability: int, lifespan_ns: int, latched: i
     assert ear.graph.asked == (3 if latched else 1)
 
 
-def test_what_is_latched_in_a_pause_is_remembered() -> None:
+def test_messages_latched_during_a_pause_are_remembered() -> None:
     """It is counted and dropped as anything else, and put for the slices that follow."""
     ear = Ear(own=True, graph=Graph(durability=1), max_bytes=8)
     ear.queue.paused = True
@@ -218,7 +218,7 @@ def test_what_is_latched_in_a_pause_is_remembered() -> None:
 
 
 @pytest.mark.parametrize(('named', 'expected'), [((), {'/imu', '/odom'}), (('/rosout',), {'/rosout'})])
-def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tuple[str, ...], expected: set[str]) -> None:
+def test_topics_of_the_ring_alone_are_in_a_bag_only_if_named(named: tuple[str, ...], expected: set[str]) -> None:
     """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
     bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, wanted_topics=TopicChoice(BagSettings(), named))
     nothing: Any = None

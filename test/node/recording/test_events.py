@@ -70,7 +70,7 @@ class Ear:
         self.consumer.take(Drained(topic, STRING, '', messages, None, 0.0, paused))
 
 
-def test_it_wants_what_is_kept_and_what_conditions_look_at() -> None:
+def test_events_need_topics_of_the_ring_and_of_conditions() -> None:
     """Names as the node's namespace makes them; a topic that only a condition looks at is not kept."""
     ear = Ear(topics=('imu',), regex='^/odom', conditions=('low: lowstate:bms_state.soc < 20', 'hot: imu:temperature > 80'))
     assert ear.wanted('/odom', '/other') == {'/r0/imu', '/odom', '/r0/lowstate'}
@@ -116,7 +116,7 @@ def seen(inbox: Inbox) -> list[int | None]:
     return [message.number for _, _, message in inbox.take('/x')]
 
 
-def test_conditions_look_at_some_messages_only() -> None:
+def test_conditions_check_a_sample_of_messages() -> None:
     """Ten of a drain, evenly, the newest among them; one where a condition holds for a time, or messages are large."""
     (now,), (later,) = conditions(['x: /x:data > 1']), conditions(['x: /x:data > 1 for 5'])
     inbox = Inbox([('/x', now)])

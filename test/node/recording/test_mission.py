@@ -150,7 +150,7 @@ def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitSta
     assert [(bool(told), told.run_id) for told in setting.told] == [(True, None), (True, 'run7'), (False, None)]
 
 
-def test_a_mark_has_the_agent_s_spelling(tmp_path: Path, opened: ExitStack) -> None:
+def test_a_mark_has_the_agents_spelling(tmp_path: Path, opened: ExitStack) -> None:
     """Whatever the agent calls its mission."""
     setting, logger = watching(opened, tmp_path)
     logger.start_mission('Küche\n\N{DOG FACE}', '')
@@ -190,7 +190,7 @@ def test_robot_state_is_journaled(tmp_path: Path, opened: ExitStack) -> None:
     assert points[-1]['distance_traveled_m'] == pytest.approx(0.3)
 
 
-def test_it_joins_only_when_it_is_asked_to(tmp_path: Path, opened: ExitStack) -> None:
+def test_the_node_joins_a_mission_only_if_configured(tmp_path: Path, opened: ExitStack) -> None:
     """Without ``join`` objects are marked all the same, and the mission's folder is left alone."""
     setting, logger = watching(opened, tmp_path, join=False)
     logger.start_mission('patrol', '')
@@ -212,7 +212,7 @@ def test_poses_are_read_from_odometry() -> None:
     ]  # fmt: skip
 
 
-def test_a_field_is_read_once_a_period() -> None:
+def test_a_field_is_read_once_per_period() -> None:
     """Any number of any type, an array's element as well."""
     observer = new_observer(battery='joint_states:position.1', temperature='')
     joints = STORE.types['sensor_msgs/msg/JointState']
@@ -246,7 +246,7 @@ def test_a_battery_state_is_logged_in_percent(caplog: pytest.LogCaptureFixture) 
     ]
 
 
-def test_a_picture_is_taken_every_few_seconds() -> None:
+def test_a_frame_is_taken_every_few_seconds() -> None:
     """As the camera published it; other sensors' pictures are none of the mission's."""
     observer, kind = new_observer(frame_every_s=5.0), 'sensor_msgs/msg/CompressedImage'
     image = STORE.types[kind](a_header(), 'jpeg', np.frombuffer(JPEG, np.uint8))
@@ -256,7 +256,7 @@ def test_a_picture_is_taken_every_few_seconds() -> None:
     assert list(observer.facts(batch('other', '/c', kind, image))) == []
 
 
-def test_pictures_of_a_robot_without_a_sensor_camera() -> None:
+def test_without_a_camera_sensor_the_first_image_sensor_is_used() -> None:
     """Those of the first sensor with pictures, until there is a ``camera``."""
     settings = given({}, Path('nowhere'))
     camera = next(sensor for sensor in settings.sensors if sensor.name == 'camera')
@@ -270,7 +270,7 @@ def test_pictures_of_a_robot_without_a_sensor_camera() -> None:
     assert found == [[Frame], [], [Frame], [Frame], []]
 
 
-def test_poses_without_odometry() -> None:
+def test_without_odometry_poses_come_from_tf() -> None:
     """They are those of tf, until there is odometry."""
     kind = 'tf2_msgs/msg/TFMessage'
     settings = given({}, Path('nowhere'))
@@ -285,7 +285,7 @@ def test_poses_without_odometry() -> None:
 @pytest.mark.parametrize(
     ('parameters', 'again'), [({}, 0), ({'camera.format': 'png'}, 1), ({'camera.format': 'zip', 'camera.batch_s': 1.0}, 1)]
 )
-def test_a_raw_picture_is_encoded_once(monkeypatch: pytest.MonkeyPatch, parameters: dict[str, object], again: int) -> None:
+def test_a_raw_frame_is_encoded_once(monkeypatch: pytest.MonkeyPatch, parameters: dict[str, object], again: int) -> None:
     """The mission has the JPEG that was made for the sensor; it makes one of its own only where the sensor's object is none."""
     made: list[int] = []
 
@@ -311,7 +311,7 @@ def test_a_raw_picture_is_encoded_once(monkeypatch: pytest.MonkeyPatch, paramete
 
 
 @pytest.mark.parametrize(('row_step', 'pad'), [(48, 0), (0, 0), (96, 0), (60, 12)])
-def test_the_floor_under_an_organized_cloud(row_step: int, pad: int) -> None:
+def test_an_organized_cloud_gives_the_floor_plan(row_step: int, pad: int) -> None:
     """The floor plan has each point of a cloud with several rows where it is, however these are laid out."""
     types = STORE.types
     points = np.arange(24, dtype='<f4').reshape(6, 4)

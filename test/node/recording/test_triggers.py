@@ -37,7 +37,7 @@ def test_a_condition_triggers_once_for_each_time_that_it_holds(text: str, values
     assert fired(text, values) == places
 
 
-def test_a_number_that_trembles_triggers_once() -> None:
+def test_a_noisy_number_triggers_once() -> None:
     """Without a hold time as well: it is armed again only after a second without it."""
     assert fired('x: t:f < 20', [19, 21] * 50, period_s=0.1) == [0]
 
@@ -80,7 +80,7 @@ def test_an_agent_event_triggers_once(tmp_path: Path) -> None:
     journal.close()
 
 
-def test_what_an_agent_logged_long_ago_is_no_trigger(tmp_path: Path) -> None:
+def test_an_old_agent_event_does_not_trigger(tmp_path: Path) -> None:
     """A node that starts in the middle of a mission makes no events of its past."""
     journal = Journal(tmp_path / 'journal')
     journal.create()

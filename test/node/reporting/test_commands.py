@@ -126,7 +126,7 @@ def ask(commands: Commands, do: str, **arguments: Any) -> tuple[bool, str]:
     [((12, 345), '12 objects with 345 messages spooled'), ((1, 1), '1 object with 1 message spooled'),
      ((0, 0), '0 objects with 0 messages spooled')],
 )  # fmt: skip
-def test_a_flush_goes_along_the_data_flow(spooled: tuple[int, int], words: str) -> None:
+def test_a_flush_follows_the_data_flow(spooled: tuple[int, int], words: str) -> None:
     """First the open batches, then the queue, then the disk; the answer says what became durable meanwhile."""
     stages = Stages(spooled=spooled)
     assert ask(stages.commands(), 'flush') == (True, words)
@@ -163,7 +163,7 @@ def test_a_pause_on_a_slow_disk_is_a_pause() -> None:
 
 
 @pytest.mark.parametrize('paused', [True, False])
-def test_an_intake_that_hangs_neither_pauses_nor_resumes(*, paused: bool) -> None:
+def test_a_hung_intake_neither_pauses_nor_resumes(*, paused: bool) -> None:
     """It is not a success, and the state stays what it was."""
     stages = Stages('pause' if paused else 'resume')
     stages.paused = not paused
@@ -182,7 +182,7 @@ def test_a_pause_ends() -> None:
     assert ask(commands, 'resume') == (True, 'not paused')
 
 
-def test_one_source_that_fails_does_not_stop_the_others() -> None:
+def test_a_failing_source_does_not_stop_the_others() -> None:
     """All steps of a round are done in their order, and the failure is raised in the end."""
     done: list[int] = []
 
@@ -196,7 +196,7 @@ def test_one_source_that_fails_does_not_stop_the_others() -> None:
     assert done == [0, 1, 2]
 
 
-def test_each_service_asks_for_what_there_is() -> None:
+def test_each_service_has_a_command() -> None:
     """No service is answered by an error about its own request."""
     commands = Stages().commands()
     known = commands.answer({'do': 'describe'})['commands']
@@ -228,7 +228,7 @@ def test_each_service_asks_for_what_there_is() -> None:
         ({'do': 'diagnostics'}, 'there is no status yet'),
     ],
 )
-def test_what_cannot_be_done_is_an_answer(request_: Mapping[str, Any], words: str) -> None:
+def test_an_impossible_request_is_answered(request_: Mapping[str, Any], words: str) -> None:
     """It says what is wrong in few words, and nothing was done."""
     stages = Stages()
     answer = stages.commands().answer(request_)
@@ -237,7 +237,7 @@ def test_what_cannot_be_done_is_an_answer(request_: Mapping[str, Any], words: st
     assert len(answer['error']) < 500
 
 
-def test_a_defect_in_a_command_is_an_answer(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_defect_in_a_command_is_answered(caplog: pytest.LogCaptureFixture) -> None:
     """The node goes on; the log has the traceback."""
     done, words = ask(Stages().commands(), 'bag split')
     assert (done, words) == (False, 'it failed because of a bug in this program: OSError: the disk burns')
@@ -266,7 +266,7 @@ def test_read_only_commands() -> None:
     assert commands.answer({'do': 'describe'})['node'] == '/ns/sensor_logger_node'
 
 
-def test_what_changes_something_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+def test_commands_that_change_something_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     """A failure as a warning; what only tells something is not."""
     caplog.set_level(logging.INFO)
     commands = Stages().commands()
@@ -319,7 +319,7 @@ def test_uploads_yield_for_some_seconds(caplog: pytest.LogCaptureFixture) -> Non
     assert ask(stages.commands(), 'yield')[0] is False
 
 
-def test_pull_requests_kept_data() -> None:
+def test_a_pull_requests_kept_data() -> None:
     """The answer has the id of the request; what nobody can ask for is refused, and where nothing is kept all is."""
     stages = Stages()
     assert ask(stages.commands(), 'pull', want={'sensor': 'camera'}) == (

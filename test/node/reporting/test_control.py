@@ -82,7 +82,7 @@ def test_a_request_is_done_and_answered(serve: Callable[..., Serving]) -> None:
 
 
 @pytest.mark.parametrize('umask', [0o000, 0o077])
-def test_it_is_for_its_owner_alone(serve: Callable[..., Serving], umask: int) -> None:
+def test_the_socket_is_for_its_owner_alone(serve: Callable[..., Serving], umask: int) -> None:
     """Whatever the umask; nothing of its making is left beside it, and nothing of it after its end."""
     before = os.umask(umask)
     try:
@@ -131,7 +131,7 @@ except NodeUnavailable as error:
      b'{"do": "\\ud800"}', b'1' * 50_000],
     ids=lambda line: repr(line[:16]),
 )  # fmt: skip
-def test_what_is_no_request_gets_an_error(serve: Callable[..., Serving], line: bytes) -> None:
+def test_an_invalid_request_gets_an_error(serve: Callable[..., Serving], line: bytes) -> None:
     """Nothing is done, and the next line of the same client is."""
     serving = serve()
     with raw(serving) as client:
@@ -145,7 +145,7 @@ def test_what_is_no_request_gets_an_error(serve: Callable[..., Serving], line: b
 
 
 @pytest.mark.parametrize('content', [b'{"do": "' + b'x' * 10_000_000 + b'"}\n', os.urandom(10_000_000).replace(b'\n', b'\r')])
-def test_a_line_has_a_longest(serve: Callable[..., Serving], content: bytes) -> None:
+def test_a_line_has_a_maximum_length(serve: Callable[..., Serving], content: bytes) -> None:
     """Ten megabytes, or what never ends, are refused as soon as they are too long, and the client is left."""
     serving = serve()
     with raw(serving) as client:
@@ -157,7 +157,7 @@ def test_a_line_has_a_longest(serve: Callable[..., Serving], content: bytes) -> 
     assert serving.asked == [{'do': 'flush'}]
 
 
-def test_the_longest_line_is_taken(serve: Callable[..., Serving]) -> None:
+def test_a_line_of_maximum_length_is_accepted(serve: Callable[..., Serving]) -> None:
     """The bound is the one that is told."""
     serving = serve()
     line = b'{"do": "tell"' + b' ' * (MAX_REQUEST_BYTES - 14) + b'}\n'
@@ -180,7 +180,7 @@ def test_an_incomplete_line_is_not_a_request(serve: Callable[..., Serving]) -> N
 
 
 @pytest.mark.parametrize('drips', [False, True])
-def test_a_client_has_to_send_a_line(serve: Callable[..., Serving], drips: bool) -> None:
+def test_a_client_must_send_a_line(serve: Callable[..., Serving], drips: bool) -> None:
     """One that says nothing, or a letter now and then, is left after a while."""
     serving = serve(idle_s=SHORT_S)
     with raw(serving) as client:
@@ -194,7 +194,7 @@ def test_a_client_has_to_send_a_line(serve: Callable[..., Serving], drips: bool)
     assert works(serving)
 
 
-def test_a_client_has_to_read(serve: Callable[..., Serving]) -> None:
+def test_a_client_must_read_its_answer(serve: Callable[..., Serving]) -> None:
     """One that does not is left after a while; others are served meanwhile, and no answer of it stays in memory."""
     serving = serve(read_s=SHORT_S)
     with raw(serving) as client:
@@ -205,7 +205,7 @@ def test_a_client_has_to_read(serve: Callable[..., Serving]) -> None:
         assert works(serving)
 
 
-def test_there_are_so_many_clients_at_most(serve: Callable[..., Serving]) -> None:
+def test_the_number_of_clients_is_limited(serve: Callable[..., Serving]) -> None:
     """Of a hundred all the others are told at once, and there is room again when some have gone."""
     serving = serve()
     clients = [raw(serving) for _ in range(100)]
@@ -249,7 +249,7 @@ def test_clients_are_notified_on_close(serve: Callable[..., Serving]) -> None:
         connect(serving.spool)
 
 
-def test_it_closes_while_it_answers(serve: Callable[..., Serving], caplog: pytest.LogCaptureFixture) -> None:
+def test_the_socket_can_be_closed_during_an_answer(serve: Callable[..., Serving], caplog: pytest.LogCaptureFixture) -> None:
     """Also where the answer and the end come together."""
     serving = serve()
     gate, client = threading.Event(), raw(serving)
@@ -268,7 +268,7 @@ def test_it_closes_while_it_answers(serve: Callable[..., Serving], caplog: pytes
     assert not caplog.records
 
 
-def test_a_node_that_dies_is_noticed(tmp_path: Path) -> None:
+def test_a_killed_node_is_detected(tmp_path: Path) -> None:
     """A client whose node goes away in the middle of an answer is told so."""
     with socket.socket(socket.AF_UNIX) as listener:
         with address(tmp_path, 'control.sock') as there:
@@ -289,7 +289,7 @@ def test_a_node_that_dies_is_noticed(tmp_path: Path) -> None:
             connection.ask('flush')
 
 
-def test_an_answer_without_an_end_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endless_answer_is_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever listens there cannot fill the memory of a client."""
     monkeypatch.setattr(control, 'MAX_ANSWER_BYTES', 1 << 16)
     with socket.socket(socket.AF_UNIX) as listener:
@@ -304,7 +304,7 @@ def test_an_answer_without_an_end_is_left(tmp_path: Path, monkeypatch: pytest.Mo
             node.close()
 
 
-def test_what_a_killed_node_left_behind_is_replaced(serve: Callable[..., Serving], tmp_path: Path) -> None:
+def test_the_socket_of_a_killed_node_is_replaced(serve: Callable[..., Serving], tmp_path: Path) -> None:
     """A socket that nobody listens on, and one that was never finished."""
     spool = tmp_path / 'spool'
     spool.mkdir(mode=0o700)
@@ -318,7 +318,7 @@ def test_what_a_killed_node_left_behind_is_replaced(serve: Callable[..., Serving
     assert sorted(path.name for path in spool.iterdir()) == ['control.lock', 'control.sock']
 
 
-def test_several_nodes_of_one_spool(serve: Callable[..., Serving]) -> None:
+def test_several_nodes_of_one_spool_have_separate_sockets(serve: Callable[..., Serving]) -> None:
     """The first has the socket's usual name, each other one its robot's; clients find them by their robots."""
     first, second = serve(robot='thor'), serve(robot='tachi')
     assert sorted(path.name for path in first.spool.glob('*.sock')) == ['control-tachi.sock', 'control.sock']
@@ -344,7 +344,7 @@ def test_the_path_of_the_spool_may_be_long(serve: Callable[..., Serving], tmp_pa
     assert len(str(spool)) > 500
 
 
-def test_a_disk_that_takes_no_socket_is_asked_again(serve: Callable[..., Serving], tmp_path: Path,
+def test_a_socket_that_cannot_be_created_is_tried_again(serve: Callable[..., Serving], tmp_path: Path,
                                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     """The thread fails, which is told as that of any other; once it can be made the socket is there."""
     may = threading.Event()

@@ -61,7 +61,7 @@ def told(name: str, **values: Any) -> tuple[Any, str]:
     return found[name][1], found[name][2]
 
 
-def test_publishers_that_are_not_heard() -> None:
+def test_undiscovered_publishers_are_an_error() -> None:
     """Say so at their topic, which has an entry of its own then whether anything was heard of it or not."""
     undiscovered = {
         topic: {'publishers': 1, 'nodes': [], 'seconds': 40, 'text': f'{topic} is not all heard'} for topic in ('/imu', '/odom')
@@ -70,7 +70,7 @@ def test_publishers_that_are_not_heard() -> None:
         assert told(topic, middleware__undiscovered=undiscovered) == (ERROR, f'{topic} is not all heard')
 
 
-def test_all_is_fine() -> None:
+def test_a_healthy_node_is_ok() -> None:
     """There is an entry for each topic, the bag, events, spool, store, clock, workers and the node; old losses are told once."""
     found = list(entries(changed(), changed()))
     assert [entry[0] for entry in found] == ['node', '/imu', 'bag', 'events', 'spool', 'store', 'clock', 'workers']
@@ -99,7 +99,7 @@ def test_all_is_fine() -> None:
         ({'topic__other_types': {'B': {}}}, WARN, 'it was published as B too; only go2_interfaces/msg/IMU is logged'),
     ],
 )  # fmt: skip
-def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
+def test_the_state_of_a_topic_has_its_level(values: dict[str, Any], level: Any, words: str) -> None:
     """Losses since a moment ago and silence need a look; one that nobody publishes is stale, one that is off is fine."""
     assert told('/imu', **values) == (level, words)
 
@@ -142,7 +142,7 @@ def test_a_topic(values: dict[str, Any], level: Any, words: str) -> None:
         ('workers', {'stalls': {'encode': 'no batch', 'delivery': 'x'}}, WARN, 'encode: no batch'),
     ],
 )  # fmt: skip
-def test_the_rest(name: str, values: dict[str, Any], level: Any, words: str) -> None:
+def test_every_other_part_has_its_level(name: str, values: dict[str, Any], level: Any, words: str) -> None:
     """A store that is away and a spool that fills up need a look; refused credentials, quarantine and defects need a hand."""
     found = told(name, **values)
     assert found[0] == level

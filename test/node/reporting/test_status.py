@@ -164,7 +164,7 @@ def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
     assert setting.status.earlier.topics['/imu'].received == total - 50
 
 
-def test_the_state_of_the_spool(setting: Setting) -> None:
+def test_the_status_has_the_state_of_the_spool(setting: Setting) -> None:
     """Objects and bytes that wait, for how long, and the room there is."""
     put(setting.spool, make('thor/a.jpg', b'12345'), make('thor/b.jpg', b'123', held='clock'))
     spool = setting.poll(3.0).spool

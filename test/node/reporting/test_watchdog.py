@@ -71,7 +71,7 @@ def stages(watch: Watch) -> Watch:
     return watch
 
 
-def test_a_topic_that_stops_while_its_publisher_lives(watch: Watch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_topic_that_stops_while_its_publisher_runs_is_reported(watch: Watch, caplog: pytest.LogCaptureFixture) -> None:
     """Told after five seconds, with its rate and the cause, once; and when it goes on, that too."""
     caplog.set_level(logging.INFO)
     watch.observe(100, times=20)
@@ -126,13 +126,13 @@ def test_a_publisher_that_left_is_not_missed(watch: Watch) -> None:
 
 
 @pytest.mark.parametrize('may_be_silent', [True, False])
-def test_a_publisher_without_a_connection(watch: Watch, *, may_be_silent: bool) -> None:
+def test_a_publisher_without_a_connection_is_reported(watch: Watch, *, may_be_silent: bool) -> None:
     """Type, QoS or firewall: that is told of every topic, for nothing can come."""
     watch.imu |= {'matched': 0, 'may_be_silent': may_be_silent}
     assert 'ros2 topic info -v /imu' in watch.wait(11)['/imu']
 
 
-def test_a_topic_that_cannot_be_subscribed_to(watch: Watch) -> None:
+def test_a_topic_that_cannot_be_subscribed_to_is_reported(watch: Watch) -> None:
     """Told at once, with the package that is missing."""
     watch.imu |= {'matched': 0, 'unavailable': 'its message package is not installed here (x)'}
     assert watch.poll() == {'/imu': 'it cannot be subscribed to here: its message package is not installed here (x)'}
@@ -162,7 +162,7 @@ def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: di
      ('encode-0', 61.0, 'one batch has taken 61 s'), ('mission', 31.0, 'missions have not been followed for 31 s'),
      ('event-writer', 31.0, 'nothing more is written to its bag for 31 s')],
 )  # fmt: skip
-def test_a_round_that_hangs(stages: Watch, name: str, busy_s: float, words: str) -> None:
+def test_a_hung_thread_is_reported(stages: Watch, name: str, busy_s: float, words: str) -> None:
     """Each thread has its own patience; for the one that holds the drain lock any length is fine."""
     stages.workers['upload-lock']['busy_s'] = 1e6
     stages.workers[name]['busy_s'] = busy_s - 1.1
@@ -173,7 +173,7 @@ def test_a_round_that_hangs(stages: Watch, name: str, busy_s: float, words: str)
     assert words in found[name]
 
 
-def test_a_pool_that_encodes_nothing(stages: Watch) -> None:
+def test_a_pool_that_encodes_nothing_is_reported(stages: Watch) -> None:
     """Batches wait and none is finished; a full queue that moves is none."""
     stages.queue['batches'] = 7
     for number in range(30):
@@ -194,7 +194,7 @@ def test_a_pool_that_encodes_nothing(stages: Watch) -> None:
         ({'state': 'idle'}, 'a bug in this program'),
     ],
 )
-def test_a_drain_that_sends_nothing(stages: Watch, store: dict[str, Any], words: str) -> None:
+def test_an_upload_that_stalls_is_reported(stages: Watch, store: dict[str, Any], words: str) -> None:
     """Objects wait, the store is not known to be away, and for longer than a request can take no byte is sent."""
     stages.store |= store
     stages.status['spool']['pending'] = 9
@@ -208,7 +208,7 @@ def test_a_drain_that_sends_nothing(stages: Watch, store: dict[str, Any], words:
     'store',
     [{'state': 'store_down'}, {'state': 'paused'}, {'state': 'not_draining'}, {'state': 'shipping', 'mbps': 0.001}],
 )  # fmt: skip
-def test_a_drain_that_has_a_reason_or_moves(stages: Watch, store: dict[str, Any]) -> None:
+def test_an_upload_with_a_reason_to_wait_is_not_reported(stages: Watch, store: dict[str, Any]) -> None:
     """A store that is away tells so itself, and a slow one is none that stands still."""
     stages.store |= store
     stages.status['spool']['pending'] = 9
