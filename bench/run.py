@@ -58,6 +58,7 @@ STEPS: Final = (
     Step('lake', quick=('--days', '2', '--objects', '500')),
     Step('ask', quick=('--objects', '50000', '--missions', '5000')),
     Step('datasets', ('--frames', '300'), quick=None),
+    Step('training_reads', quick=None),
     Step('dataset_index', quick=('--rows', '36000', '--rounds', '1')),
     Step('likeness', quick=('--vectors', '8640')),
     Step('encode_formats'),
@@ -66,7 +67,8 @@ STEPS: Final = (
 )
 FOLDERLESS: Final = ('encode_formats',)
 ABSENT: Final = {
-    name for name, is_here in {'datasets': LEROBOT.is_file(), 'rosbag2': shutil.which('ros2')}.items() if not is_here
+    *(() if LEROBOT.is_file() else ('datasets', 'training_reads')),
+    *(() if shutil.which('ros2') else ('rosbag2',)),
 }
 """Benchmarks against programs that are not on this machine: the page keeps the earlier results."""
 

@@ -3,8 +3,8 @@
 Run it as ``python bench/training_reads.py [--frames 900] [--windows 200] [--rounds 3] [--json]`` if lerobot has an environment
 that has our package's dependencies too (docs/development.md). Ours reads single JPEGs, and archives of a second, from a
 SeaweedFS; lerobot reads a set of AV1 on the local disk, which its own writer wrote. Both run in the same Python with torch's
-DataLoader and two workers, and make the same tensors. Opening the dataset and starting the workers is included, importing
-modules is not.
+DataLoader and two workers, and make the same tensors of float32; once ours leaves the bytes to where the model runs. Opening
+the dataset and starting the workers is included, importing modules is not.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Final
 
 import numpy as np
 import simplejpeg
+from _frames import fill
 from _report import LEROBOT, Bar, Report, main, progress
 from _world import make_bucket
-from dataset import fill
 from datasets import run
 from obstore.store import S3Store
 from shadowhound_tower.embedded import Tower
@@ -76,7 +76,8 @@ def measure(options: argparse.Namespace) -> Report:
         environ = {**tower.environment(), 'PYTHONPATH': str(HERE.parent)}
         os.environ.update(environ)
         ways = {
-            'single images': ('ours', 'thor'), 'archives of a second': ('ours', 'tachi'), 'lerobot': ('lerobot', str(made)),
+            'single images': ('float', 'thor'), 'archives of a second': ('float', 'tachi'),
+            'archives of a second, as uint8': ('bytes', 'tachi'), 'lerobot': ('lerobot', str(made)),
         }  # fmt: skip
         found: dict[str, list[dict[str, float]]] = {name: [] for name in ways}
         for number in range(options.rounds):
