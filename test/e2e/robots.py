@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import simplejpeg
 from e2e.processes import COMMANDS, Node, Processes, Publisher, until
-from live.test_page import fits, holds, opened
+from live.browsing import fits, holds, opened
 from missions.server import complete
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

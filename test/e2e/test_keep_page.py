@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from e2e.processes import GENTLE, Processes, until
-from live.test_page import CHROMIUM, fits, holds, opened, press
+from live.browsing import CHROMIUM, fits, holds, opened, press
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -17,7 +17,7 @@ import pytest
 import simplejpeg
 from e2e.processes import Processes, until
 from e2e.robots import ARM, ARM_JOINTS, BASE, DRONE, LATITUDE, LONGITUDE, STORE, Robot, Sent, message, unitree
-from live.test_page import holds, press
+from live.browsing import holds, press
 
 from shadowhound_data_logger.core.type_rules import RULES, is_of_unitree
 
