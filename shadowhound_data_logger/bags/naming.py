@@ -86,4 +86,4 @@ def key_of(robot: str, bag: str, file: str) -> str:
 
 def natural_key(name: str) -> list[str | int]:
     """A sort key in which ``bag_10`` comes after ``bag_9``."""
-    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r'(\d+)', name, flags=re.ASCII))]
+    return [int(part) if index % 2 else part for index, part in enumerate(re.split(r'(\d+)', name, flags=re.ASCII))]

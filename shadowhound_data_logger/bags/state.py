@@ -149,8 +149,8 @@ class BagState:
         return RecordingRows(
             self.folder.name, self._description(), json.dumps([_channel_fields(one) for one in self._channels.values()]),
             tuple(self._slice_row(info) for info in slices),
-            tuple(MissingRow(place, one.file, one.what, one.messages, one.topic, one.reason)
-                  for place, one in enumerate(self.missing[first:], first)),
+            tuple(MissingRow(index, one.file, one.what, one.messages, one.topic, one.reason)
+                  for index, one in enumerate(self.missing[first:], first)),
         )  # fmt: skip
 
     def all_rows(self) -> list[RecordingRows]:

@@ -110,10 +110,10 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
     with tempfile.TemporaryDirectory(dir=plan.files[-1].path.parent) as work:
         try:
             _check_names(spool, plan)
-            for place, file in enumerate(plan.files):
+            for index, file in enumerate(plan.files):
                 if spool.reading.objects.knows(BUCKET, file.key, file.sha256):
                     continue
-                link = Path(work) / str(place)
+                link = Path(work) / str(index)
                 _link_or_copy(file.path, link)
                 objects.append(_object(file, link))
             for begin in range(0, len(objects), MAX_OBJECTS):  # the manifest is the last

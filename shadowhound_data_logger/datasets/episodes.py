@@ -297,7 +297,7 @@ def _names(stream: _Stream) -> tuple[str, ...]:
         return part.names
     if part.sensor.startswith('/'):
         return _field_names(part, stream.series.names, width)
-    named = stream.series.names if len(stream.series.names) == width else tuple(f'joint_{place}' for place in range(width))
+    named = stream.series.names if len(stream.series.names) == width else tuple(f'joint_{index}' for index in range(width))
     prefix = 'arm_' if _belongs_to_arm(stream.plan) else ''
     return tuple(f'{prefix}{name}.pos' for name in named)
 

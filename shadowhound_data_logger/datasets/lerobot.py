@@ -106,8 +106,8 @@ class Lerobot:
 
     def _rows(self) -> Iterator[EpisodeRow]:
         assert self.info is not None
-        for place, path in enumerate(sorted((self.folder / 'meta/episodes').glob('*/*.parquet'))):
-            if place >= self.info['total_episodes']:
+        for index, path in enumerate(sorted((self.folder / 'meta/episodes').glob('*/*.parquet'))):
+            if index >= self.info['total_episodes']:
                 return  # from a run that was killed before it updated info.json
             yield pq.read_table(path).to_pylist()[0]
 

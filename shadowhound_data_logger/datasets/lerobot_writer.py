@@ -197,8 +197,8 @@ class LerobotWriter(Lerobot):
         before: dict[str, pa.Table] = {}
         if path.is_file():
             file = pq.ParquetFile(path)
-            for place in range(file.num_row_groups):
-                table = file.read_row_group(place)
+            for index in range(file.num_row_groups):
+                table = file.read_row_group(index)
                 before[table[EPISODE][0].as_py()] = table
         with replacing(path, is_synced=True) as out, pq.ParquetWriter(out, schema, compression='zstd') as writer:
             for mission in self.mission_ids:
@@ -396,8 +396,8 @@ def _write_data(source: Path, target: Path, row: EpisodeRow, task: int, features
     file, begin = pq.ParquetFile(source), 0
     with replacing(target, is_synced=True) as out:
         writer: pq.ParquetWriter | None = None
-        for place in range(file.num_row_groups):
-            table = file.read_row_group(place)
+        for index in range(file.num_row_groups):
+            table = file.read_row_group(index)
             count, first = len(table), int(row['dataset_from_index']) + begin
             table = table.append_column('episode_index', pa.array([row['episode_index']] * count, pa.int64()))
             table = table.append_column('index', pa.array(range(first, first + count), pa.int64()))

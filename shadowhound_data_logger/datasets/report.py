@@ -30,8 +30,8 @@ def draw(made: Lerobot, target: Path) -> None:
     """Draw a dataset that has at least one episode. Raises LakeError, OSError."""
     rows = evenly_spaced(made.rows, MOST)
     sheet = Image.new('RGB', (WIDTH, len(rows) * (HEIGHT + GAP) + GAP), 'white')
-    for place, row in enumerate(rows):
-        _episode(made, row, sheet, GAP + place * (HEIGHT + GAP))
+    for index, row in enumerate(rows):
+        _episode(made, row, sheet, GAP + index * (HEIGHT + GAP))
     with io.BytesIO() as body:
         sheet.save(body, 'PNG')
         target.write_bytes(body.getvalue())

@@ -304,7 +304,7 @@ class Recordings:
         order = np.argsort(times_of, kind='stable')
 
         def image(message: int) -> tuple[bytes, str]:
-            coming = {where[int(order[place])][0] for place in range(message, min(message + AHEAD, len(order)))}
+            coming = {where[int(order[index])][0] for index in range(message, min(message + AHEAD, len(order)))}
             prefetch.ahead([objects[number] for number in sorted(coming)])
             number, member = where[int(order[message])]
             if member < 0:

@@ -161,8 +161,8 @@ def _with_infinities(value: Any) -> Any:
         return [_with_infinities(item) for item in value]
     if isinstance(value, np.ndarray) and value.dtype.kind == 'f' and len(places := np.flatnonzero(np.isinf(value))):
         parts = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].split(b',')
-        for place in places:
-            parts[place] = b'"%b"' % INFINITE[int(value[place] < 0)].encode()
+        for index in places:
+            parts[index] = b'"%b"' % INFINITE[int(value[index] < 0)].encode()
         return orjson.Fragment(b'[%b]' % b','.join(parts))
     return INFINITE[int(value < 0)] if isinstance(value, (float, np.floating)) and np.isinf(value) else value
 

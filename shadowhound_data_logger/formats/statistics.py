@@ -171,12 +171,12 @@ def _have_different_keys(values: Sequence[dict[str, Any]]) -> bool:
 def _elements(name: str, values: Sequence[list[Any]], depth: int) -> Iterator[tuple[str, Sequence[Any]]]:
     sizes = set(map(len, values))
     if sizes == {max(sizes)} and max(sizes) <= MAX_ELEMENTS:
-        for place, some in enumerate(zip(*values, strict=True)):
-            yield from _fields(f'{name}.{place}', some, depth + 1)
+        for index, some in enumerate(zip(*values, strict=True)):
+            yield from _fields(f'{name}.{index}', some, depth + 1)
         return
-    for place in range(min(max(sizes), MAX_ELEMENTS)):
-        if short := [value[place] for value in values if place < len(value) <= MAX_ELEMENTS]:
-            yield from _fields(f'{name}.{place}', short, depth + 1)
+    for index in range(min(max(sizes), MAX_ELEMENTS)):
+        if short := [value[index] for value in values if index < len(value) <= MAX_ELEMENTS]:
+            yield from _fields(f'{name}.{index}', short, depth + 1)
     if long := [element for value in values if len(value) > MAX_ELEMENTS for element in value]:
         yield from _fields(f'{name}.*', long, depth + 1)
 

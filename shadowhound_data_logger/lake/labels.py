@@ -158,10 +158,10 @@ def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
         if each.key is not None:
             of_keys.setdefault((each.bucket or BUCKET, each.key), set()).add(each.label)
             continue
-        for place in np.flatnonzero(
+        for index in np.flatnonzero(
             (robots_of == each.robot) & (first <= each.until_ns) & (last >= each.since_ns) & (first >= 0)
         ):
-            said[int(place)].add(each.label)
+            said[int(index)].add(each.label)
     if of_keys:
         for number, name in enumerate(zip(rows['bucket'].to_pylist(), rows['key'].to_pylist(), strict=True)):
             said[number] |= of_keys.get(name, set())

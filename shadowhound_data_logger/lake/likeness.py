@@ -120,7 +120,7 @@ def like(source: Bucket, model: OnnxPair, wanted: Vectors, *, limit: int, findin
     digests, vectors = _collected(_parts(source, model, rows, findings))
     if len(vectors) and vectors.shape[1] != len(wanted):
         raise LakeError(f'{model.name} computes vectors of {len(wanted)} numbers, but those in the store have {vectors.shape[1]}')
-    at = {digest: place for place, digest in enumerate(digests)}
+    at = {digest: index for index, digest in enumerate(digests)}
     places = np.array([at.get(bytes.fromhex(each), -1) for each in rows['sha256'].to_pylist()], np.intp)
     have = np.flatnonzero(places >= 0)
     best, scores = nearest(vectors[places[have]], wanted, limit)

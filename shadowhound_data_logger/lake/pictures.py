@@ -138,7 +138,7 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
             spans.setdefault(word, {}).setdefault(line, []).append((begin_ns, end_ns))
     open_ = spans.pop(NOT_KNOWN, {})
     causes = sorted(spans.keys() - {STORED, DOWNSAMPLED})
-    colors = {STORED: plots.BLUE, DOWNSAMPLED: SKY, **{cause: LOST[place % len(LOST)] for place, cause in enumerate(causes)},
+    colors = {STORED: plots.BLUE, DOWNSAMPLED: SKY, **{cause: LOST[index % len(LOST)] for index, cause in enumerate(causes)},
                NOT_KNOWN: PALE}  # fmt: skip
     begin_ns, end_ns = found[0].known.begin_ns, found[0].known.end_ns
     pixel_ns = (end_ns - begin_ns) // LINE_DOTS

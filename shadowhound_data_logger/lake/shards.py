@@ -43,14 +43,14 @@ def shards(tracks: Sequence[Track], chosen: Sequence[NDArray[np.intp]]) -> list[
     found: list[Shard] = []
     for number, (track, objects) in enumerate(zip(tracks, chosen, strict=True)):
         first = 0
-        for place in range(len(objects)):
-            is_archive = track.count[objects[place]] > 1
-            if is_archive and place > first:
-                found.append(Shard(number, first, place))
-                first = place
-            if is_archive or place + 1 - first == SHARD:
-                found.append(Shard(number, first, place + 1))
-                first = place + 1
+        for index in range(len(objects)):
+            is_archive = track.count[objects[index]] > 1
+            if is_archive and index > first:
+                found.append(Shard(number, first, index))
+                first = index
+            if is_archive or index + 1 - first == SHARD:
+                found.append(Shard(number, first, index + 1))
+                first = index + 1
         if first < len(objects):
             found.append(Shard(number, first, len(objects)))
     return found
@@ -62,14 +62,14 @@ def order(tracks: Sequence[Track], chosen: Sequence[NDArray[np.intp]], *, share:
     every = shards(tracks, chosen)
     rng = None if seed is None else np.random.default_rng((seed, epoch))
     if rng is not None:
-        every = [every[place] for place in rng.permutation(len(every))]
+        every = [every[index] for index in rng.permutation(len(every))]
     mine = every[share[0] :: share[1]]
     mixed = None if seed is None else np.random.default_rng((seed, epoch, share[0]))
     for start in range(0, len(mine), MIXED if mixed is not None else 1):
         group = [reference for shard in mine[start : start + (MIXED if mixed is not None else 1)]
                  for reference in _references(shard, tracks, chosen)]  # fmt: skip
         places = range(len(group)) if mixed is None else mixed.permutation(len(group))
-        yield from (group[int(place)] for place in places)
+        yield from (group[int(index)] for index in places)
 
 
 def _references(shard: Shard, tracks: Sequence[Track], chosen: Sequence[NDArray[np.intp]]) -> Iterator[Reference]:

@@ -149,8 +149,8 @@ class Track:
         """(minimum distance in ns, index) of the objects that can have a message this long before or after, the nearest first."""
         found = self.within(stamp_ns - before_ns, stamp_ns + after_ns)
         away = np.maximum(np.maximum(self.start_ns[found] - stamp_ns, stamp_ns - self.end_ns[found]), 0)
-        for place in np.argsort(away, kind='stable'):
-            yield int(away[place]), int(found[place])
+        for index in np.argsort(away, kind='stable'):
+            yield int(away[index]), int(found[index])
 
     def pose_at(self, number: int, stamp_ns: int, gap_ns: int) -> NDArray[np.float64]:
         """x, y and yaw at a time in an object: its own pose for a single message, otherwise interpolated to the neighbor's."""

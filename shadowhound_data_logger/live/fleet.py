@@ -103,7 +103,7 @@ def overview(source: Bucket, findings: Findings, now_ns: int | None = None) -> l
     for name, row in found.items():
         if not row.last_ns:
             row.last_date = max((date for date in dates(source, name, (OBJECTS,), findings) if date > UNDATED), default='')
-    order = {state: place for place, state in enumerate(ORDER)}
+    order = {state: index for index, state in enumerate(ORDER)}
     return sorted(found.values(), key=lambda row: (order[row.state(now_ns)[0]], -sum(row.lost.values()), -row.last_ns, row.robot))
 
 

@@ -251,7 +251,7 @@ def _battery(message: Any) -> dict[str, float]:
 
 def _go2_state(message: Any) -> dict[str, float]:
     return {'height': float(message.body_height), **dict(_named('velocity', message.velocity)),
-            **{f'foot.{place}': float(force) for place, force in enumerate(message.foot_force)}}  # fmt: skip
+            **{f'foot.{index}': float(force) for index, force in enumerate(message.foot_force)}}  # fmt: skip
 
 
 def _fix(message: Any) -> dict[str, float]:

@@ -128,7 +128,7 @@ class PastDay:
         low, high = (int(np.searchsorted(self.begins, at_ns)) for at_ns in (begin_ns, end_ns))
         column = self._rows['battery_pct'].slice(low, max(0, high - low)).to_numpy()
         known = np.flatnonzero(~np.isnan(column.astype(np.float64)))
-        return [(int(self.begins[low + place]), float(column[place])) for place in known[:: len(known) // MAX_BATTERY + 1]]
+        return [(int(self.begins[low + index]), float(column[index])) for index in known[:: len(known) // MAX_BATTERY + 1]]
 
     def between(self, begin_ns: int, end_ns: int) -> list[PastObject]:
         """Objects that start in this time."""
@@ -581,10 +581,10 @@ def _by_bag(files: Iterable[PastObject]) -> dict[str, list[PastObject]]:
 
 def consecutive(numbers: Sequence[int]) -> Iterator[tuple[int, int]]:
     """First and last of each run of consecutive numbers."""
-    for place, number in enumerate(numbers):
-        if not place or numbers[place - 1] != number - 1:
+    for index, number in enumerate(numbers):
+        if not index or numbers[index - 1] != number - 1:
             first = number
-        if place + 1 == len(numbers) or numbers[place + 1] != number + 1:
+        if index + 1 == len(numbers) or numbers[index + 1] != number + 1:
             yield first, number
 
 

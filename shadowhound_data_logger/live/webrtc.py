@@ -414,7 +414,7 @@ def _with_address(offer: str, remote: str) -> str:
     ports = [int(found[1]) for line in lines if (found := _CANDIDATE.match(line)) and 0 < int(found[1]) < 65_536]
     lines = [line for line in lines if not line.startswith(('a=candidate', 'a=end-of-candidates', 'a=remote-candidates'))]
     ports = ports[:_MAX_CANDIDATES] or [9]  # without any, the answering side would not wait for the other
-    lines += [f'a=candidate:{place} 1 udp 2122260223 {remote} {port} typ host' for place, port in enumerate(ports)]
+    lines += [f'a=candidate:{index} 1 udp 2122260223 {remote} {port} typ host' for index, port in enumerate(ports)]
     return '\r\n'.join([*lines, 'a=end-of-candidates', ''])
 
 

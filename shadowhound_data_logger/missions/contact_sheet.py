@@ -62,8 +62,8 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
         f'{len(thumbs)} of {len(frames)} frames' if len(thumbs) < len(frames) else f'{len(thumbs)} frame{"s"[: len(thumbs) > 1]}'
     )
     pen.text((WIDTH - GAP - pen.textlength(count_text, font=_font(12)), 12), count_text, fill=PALE, font=_font(12))
-    for place, thumb in enumerate(thumbs):
-        x, y = GAP + place % columns * step_x, top + place // columns * step_y
+    for index, thumb in enumerate(thumbs):
+        x, y = GAP + index % columns * step_x, top + index // columns * step_y
         sheet.paste(thumb.image, (x, y))
         _caption(pen, (x, y + thumb.image.height + 3), width, thumb.frame, start_ns)
     sheet.save(target, 'JPEG', quality=QUALITY, optimize=True)
@@ -73,7 +73,7 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
 def evenly_spaced(items: Sequence[_Item], limit: int) -> list[_Item]:
     """At most ``limit`` items, evenly spaced, including the first and the last."""
     count = min(limit, len(items))
-    return [items[round(place * (len(items) - 1) / max(1, count - 1))] for place in range(count)]
+    return [items[round(index * (len(items) - 1) / max(1, count - 1))] for index in range(count)]
 
 
 def _columns(count: int) -> int:

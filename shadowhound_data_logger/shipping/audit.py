@@ -128,7 +128,7 @@ class AuditProgress:
         found = file.read()
         whole = len(found) - len(found) % DIGEST_BYTES
         file.truncate(whole)
-        self._known = frozenset(found[place : place + DIGEST_BYTES] for place in range(0, whole, DIGEST_BYTES))
+        self._known = frozenset(found[index : index + DIGEST_BYTES] for index in range(0, whole, DIGEST_BYTES))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

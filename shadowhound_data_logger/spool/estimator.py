@@ -316,7 +316,7 @@ def learn_period(intervals: Sequence[int], slack: float = 1.0) -> float:
     if middle <= 0:
         return 0.0
     counts = [max(0, int(gap / middle + 0.5)) for gap in intervals]
-    places = [place for place, count in enumerate(counts) if count > 1]
+    places = [index for index, count in enumerate(counts) if count > 1]
     limit = slack * MAX_LONG_SHARE * len(intervals)
     if len(places) > limit or sum(gap < 0.5 * middle for gap in intervals) > limit:
         return 0.0

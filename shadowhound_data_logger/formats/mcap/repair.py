@@ -166,9 +166,9 @@ class _Report:
 
     def add_kept(self, first_ns: int, last_ns: int) -> None:
         """Note that messages with these log times follow in the copy."""
-        for place in range(self._first_open, len(self.losses)):
-            loss = self.losses[place]
-            self.losses[place] = replace(loss, to_ns=first_ns if loss.to_ns is None else loss.to_ns)
+        for index in range(self._first_open, len(self.losses)):
+            loss = self.losses[index]
+            self.losses[index] = replace(loss, to_ns=first_ns if loss.to_ns is None else loss.to_ns)
         self._first_open, self.last_ns = len(self.losses), last_ns
 
     def set_messages(self, messages: int) -> None:

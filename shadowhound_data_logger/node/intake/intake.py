@@ -63,8 +63,8 @@ class Intake:
         self._by_turn = self._in_turn()
         pairs = [pair for sensor in sensors.values() for pair in zip(sensor.topics, sensor.types, strict=False)]
         named = {node.resolve_topic_name(topic): name for topic, name in pairs if name and len(alternatives(name)) == 1}
-        self._extra = [ExtraTopics(context, consumers[place:], named)
-                       for place, consumer in enumerate(consumers) if consumer.wanted_topics is not None]  # fmt: skip
+        self._extra = [ExtraTopics(context, consumers[index:], named)
+                       for index, consumer in enumerate(consumers) if consumer.wanted_topics is not None]  # fmt: skip
         self._listening = [extra for extra in self._extra if extra.consumer.from_start]
         self._requests = _Requests()
         self._next_poll_s = self._next_refresh_s = 0.0
