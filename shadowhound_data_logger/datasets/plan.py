@@ -208,7 +208,14 @@ def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
     ``fps`` 0: the rate of the frames is not chosen yet.
     """
     if plan.missing:
-        return f'the store has no data of {", ".join(sorted(set(plan.missing)))} in it'
+        missing = sorted(set(plan.missing))
+        images = [name for name in missing if name in options.images.values()]
+        why = f'the store has no data of {", ".join(missing)} in it'
+        return (
+            f'{why}; a LeRobot dataset needs images: name a topic with some under images in the file of --config'
+            if images
+            else why
+        )
     if plan.arm is not None and plan.arm.clock is None:
         return plan.arm.why
     if plan.never_complete and not options.allow_gaps:
