@@ -8,12 +8,12 @@ import threading
 import time
 
 import rclpy
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Twist
 from go2_interfaces.msg import IMU
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, LaserScan, PointCloud2
 
 RATE_HZ = 20.0
 SLOW_EVERY = 20
@@ -36,11 +36,17 @@ def main() -> None:
         if name != 'unheard':
             steady.append((node.create_publisher(IMU, f'/{name}/imu', RELIABLE), IMU()))
         steady.append((node.create_publisher(PointCloud2, f'/{name}/point_cloud2', BEST_EFFORT), PointCloud2()))
+    steady.append((node.create_publisher(LaserScan, '/other/scan', RELIABLE), LaserScan()))
+    silent = [
+        node.create_publisher(Image, '/other/front/image', RELIABLE),
+        node.create_publisher(Twist, '/other/cmd_vel', RELIABLE),
+    ]
     context = rclpy.Context()  # one participant has one type for a topic
     rclpy.init(context=context)
     another = Node('another', context=context, start_parameter_services=False, enable_rosout=False)
     another.create_publisher(PoseStamped, '/two/odom', RELIABLE)
     node.create_subscription(PointCloud2, '/deaf/point_cloud2', lambda _: None, RELIABLE)
+    assert all(silent)
     sys.stdout.write('ready\n')
     sys.stdout.flush()
     due, count = time.monotonic(), 0

@@ -42,6 +42,8 @@ class Examined:
     """Of a logger without a namespace."""
     foreign: list[Result]
     """Of a logger for another robot."""
+    by_type: list[Result]
+    """Of a logger without settings."""
 
 
 def examine(scene: Scene, namespace: str = '/', sensors: dict[str, Any] = SENSORS) -> list[Result]:
@@ -68,13 +70,13 @@ def examined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Examined]:
         scene.environ['ROS_DOMAIN_ID'] = str(domain)
         with ThreadPoolExecutor(len(ROBOTS)) as pool:
             found = dict(zip(ROBOTS, pool.map(lambda name: examine(scene, f'/{name}'), ROBOTS), strict=True))
-        unnamed, foreign = examine(scene), examine(scene, sensors=ARM)
+        unnamed, foreign, by_type = examine(scene), examine(scene, sensors=ARM), examine(scene, '/other', {})
         patch.setenv('ROS_DOMAIN_ID', str(other))
         scene.environ['ROS_DOMAIN_ID'] = str(other)
         nowhere = examine(scene, '/well')
         lines = ['head', f'   1: 00000000:{7400 + 250 * domain:04X} 00000000:0000 07']
         (scene.root / 'proc/net/udp').write_text('\n'.join(lines) + '\n')
-        yield Examined(domain, found, examine(scene, '/well'), nowhere, unnamed, foreign)
+        yield Examined(domain, found, examine(scene, '/well'), nowhere, unnamed, foreign, by_type)
 
 
 def test_a_topic_under_another_name_is_proposed(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,6 +193,13 @@ def test_a_robot_of_another_kind_is_named(examined: Examined) -> None:
     """With none of the configured topics in any namespace."""
     expect(findings(examined.foreign), 'ros.topics', 'shadowhound-data init')
     assert '/deaf/imu' in findings(examined.foreign)[0].seen
+
+
+def test_topics_that_are_logged_by_their_type_are_examined(examined: Examined) -> None:
+    """A camera that publishes nothing is found, and no topic of a Go2 is missed; a command that nobody gives is no fault."""
+    found = findings(examined.by_type)
+    expect([each for each in found if '/other/scan' not in each.seen], 'ros.loss', 'ros2 topic hz /other/front/image')
+    assert '/other/scan' in {result.data.get('topic') for result in examined.by_type if result.check == 'ros.rate'}
 
 
 @pytest.mark.long('a robot of its own')
