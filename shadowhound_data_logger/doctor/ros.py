@@ -75,6 +75,9 @@ STEADY: Final = frozenset({
 MAX_FOUND: Final = 100
 """Maximum topics that no sensor names to listen to."""
 TYPES_REMEDY: Final = '. ~/ros2_ws/install/setup.bash  # or: colcon build --packages-select {package} && . install/setup.bash'
+OURS_REMEDY: Final = (
+    'colcon build --base-paths src/shadowhound_data_logger/interfaces/{package} && . install/setup.bash  # in the workspace'
+)
 TF: Final = '/tf'
 STALE_S: Final = 5.0
 """Maximum age of a current transform: localization is late, and the clocks of two machines differ."""
@@ -125,11 +128,11 @@ def check(context: Context) -> Iterator[Result]:
         return
     if TF in heard:
         yield from _transforms(heard[TF])
-    is_complete = context.settings.capture.topics == NAMED or is_unitree
+    is_complete = context.settings.capture.topics == NAMED or DRIVER in packages
     streams = STREAMS if is_unitree else {}
     for sensor in sensors:
         topics = [heard[resolved[topic]] for topic in sensor.topics]
-        if is_complete or any(one.publishers for one in topics):  # the default sensors are for a Unitree
+        if is_complete or any(one.publishers for one in topics):  # only the driver of a Go2 publishes all of the default sensors
             yield from _sensor(sensor, topics, context.rates_hz, streams)
 
 
@@ -238,7 +241,7 @@ def _types_remedy(package: str) -> str:
     """The remedy for a missing message package."""
     from shadowhound_data_logger.ros.reader import SHIPPED  # noqa: PLC0415 - rclpy
 
-    remedy = TYPES_REMEDY.format(package=package)
+    remedy = (OURS_REMEDY if package in SHIPPED - {DRIVER} else TYPES_REMEDY).format(package=package)
     if package in SHIPPED:
         return remedy
     return f'sudo apt install ros-{os.environ.get("ROS_DISTRO", "$ROS_DISTRO")}-{package.replace("_", "-")}  # or {remedy}'
