@@ -22,7 +22,7 @@ from shadowhound_sim.demo_processes import THIS_MACHINE
 
 if TYPE_CHECKING:
     from shadowhound_tower.embedded import Tower
-    from stores.certificates import Authority
+    from tls_front import Authority
 
 
 ENDING_S = 60.0
@@ -225,7 +225,7 @@ def domain() -> Iterator[int]:
 @pytest.fixture(scope='module')
 def authorities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Authority]:
     """One that is trusted, and one that nobody knows."""
-    from stores.certificates import Authority
+    from tls_front import Authority
 
     folder = tmp_path_factory.mktemp('tls')
     return {name: Authority(folder, name) for name in ('authority', 'stranger')}

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
+from urllib.parse import urlsplit
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -273,8 +274,9 @@ class Tables:
 
 def storage_options(settings: StoreSettings) -> dict[str, str]:
     """The options of delta-rs. Commits are conditional puts that fail if the version exists; no other coordination is needed."""
+    allow_http = urlsplit(settings.endpoint_url or '').scheme != 'https'  # otherwise a redirect could lead to plain HTTP
     options = {
-        'AWS_ENDPOINT_URL': settings.endpoint_url or '', 'AWS_REGION': settings.region, 'AWS_ALLOW_HTTP': 'true',
+        'AWS_ENDPOINT_URL': settings.endpoint_url or '', 'AWS_REGION': settings.region, 'AWS_ALLOW_HTTP': str(allow_http).lower(),
         'AWS_VIRTUAL_HOSTED_STYLE_REQUEST': 'false', 'conditional_put': 'etag',
         'connect_timeout': '5s', 'timeout': '60s', 'retry_timeout': '60s', **proxy_options(settings.endpoint_url or ''),
     }  # fmt: skip

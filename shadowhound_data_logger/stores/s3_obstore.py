@@ -282,7 +282,8 @@ def _client(settings: StoreSettings, bucket: str) -> Client:
         given['session_token'] = settings.session_token
     if not (settings.access_key_id and settings.secret_access_key):
         given = {'credential_provider': _provider(settings)}
-    options: Any = {'allow_http': True, 'connect_timeout': _CONNECT_TIMEOUT, 'read_timeout': _READ_TIMEOUT,
+    allow_http = urlsplit(settings.endpoint_url or '').scheme != 'https'  # otherwise a redirect could lead to plain HTTP
+    options: Any = {'allow_http': allow_http, 'connect_timeout': _CONNECT_TIMEOUT, 'read_timeout': _READ_TIMEOUT,
                     'timeout': _TOTAL_TIMEOUT, **proxy_options(settings.endpoint_url or '')}  # fmt: skip
     if (authorities := _authorities(settings)) is not None:
         options['root_certificate'] = authorities

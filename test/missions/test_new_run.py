@@ -12,8 +12,7 @@ import pytest
 from e2e.wire import HANG, PASS, REFUSE, Wire
 from missions.fakes import FakePictures, FakeSpooler, FakeTracking, journalling
 from missions.server import Server, complete, until
-from stores.certificates import Authority
-from stores.tls_front import behind_tls
+from tls_front import Authority, behind_tls
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions import journal, mission, new_run

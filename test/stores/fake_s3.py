@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import socket
-import ssl
 import struct
 import threading
 from collections.abc import Iterator
@@ -187,15 +186,3 @@ def resetting(answer: bytes, *, reset: bool = True) -> Iterator[str]:
         listening.shutdown(socket.SHUT_RDWR)
         listening.close()
         thread.join()
-
-
-@contextmanager
-def with_tls(certificate: str, key: str) -> Iterator[str]:
-    """An S3 look-alike behind TLS."""
-    server = FakeS3()
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certificate, key)
-    server.socket = context.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
-    server.handle_error = lambda *_: None  # type: ignore[method-assign]
-    with served(server):
-        yield server.url.replace('http:', 'https:')
