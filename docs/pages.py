@@ -300,12 +300,12 @@ def commands() -> str:
 
 
 def _verb(name: str, verb: click.Command) -> Iterator[str]:
-    """The section of a verb: a line for each verb below it, or two examples."""
+    """The section of a verb: a line for each verb below it, or an example."""
     yield f'\n### {name}\n{verb.get_short_help_str(1000)}\n\n'
     if isinstance(verb, click.Group):
         yield from _rows((name,), verb)
     else:
-        yield from (f'    {line}\n' for line in _examples(verb)[:2])
+        yield from (f'    {line}\n' for line in _examples(verb)[:1])
 
 
 def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
@@ -379,11 +379,13 @@ def _allowed(spec: Field[Any]) -> Iterator[str]:
 
 
 def _shown(value: Any) -> str:
-    """A value in the syntax of a parameter file."""
+    """A value in the syntax of a parameter file; nothing for an empty one."""
+    if value == '':
+        return ''
     if isinstance(value, bool):
         return f'`{str(value).lower()}`'
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return ', '.join(_shown(part) for part in value) or '`[]`'
+        return ', '.join(filter(None, map(_shown, value)))
     return f'`{value}`' + _binary(value)
 
 

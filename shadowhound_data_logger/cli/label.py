@@ -135,7 +135,7 @@ def label_import(*, file: Any, robot: str | None, user: str | None, as_json: boo
 @click.option('--label', 'name', metavar='NAME', help='Only with this label.')
 @as_json
 def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCode:
-    """Show the labels in force."""
+    """Show the present labels."""
     with asking():
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415

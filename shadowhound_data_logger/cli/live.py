@@ -71,7 +71,7 @@ LOOK_S = 2.0
 @click.option('--tiles', default='', metavar='URL',
               help='Show places on map tiles from here, such as https://tile.example/{z}/{x}/{y}.png.')  # fmt: skip
 @click.option('--alert-url', metavar='URL', envvar='SHADOWHOUND_ALERT_URL',
-              help='Send alerts to this webhook or ntfy topic. A URL with a token belongs into the variable '
+              help='Send alerts to this webhook or ntfy topic. A URL with a token belongs in the variable '
                    'SHADOWHOUND_ALERT_URL.')  # fmt: skip
 @click.option('--alert-silent', type=click.FloatRange(0.1, 1000.0), default=1.0, show_default=True, metavar='HOURS',
               help='Alert if nothing from a robot arrives for longer.')  # fmt: skip

@@ -53,5 +53,5 @@ def registry() -> MlflowRegistry:
     """The one that MLFLOW_TRACKING_URI names. Raises BadUsage without one."""
     url = os.environ.get('MLFLOW_TRACKING_URI', '')
     if not url.startswith(('http://', 'https://')) or '@' in url:
-        raise BadUsage('the registry is an MLflow server, and MLFLOW_TRACKING_URI names none', 'set it: http://TOWER_IP:5001')
+        raise BadUsage('the registry is an MLflow server, and MLFLOW_TRACKING_URI names none', 'set it: http://SERVER:5001')
     return MlflowRegistry(MlflowRest(url.rstrip('/'), os.environ, Path.home()))

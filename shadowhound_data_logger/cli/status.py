@@ -64,7 +64,7 @@ class Page:
 
     report: NodeReport
     others: tuple[str, ...] = ()
-    """Other robots whose nodes run here."""
+    """Other robots whose nodes run here; if none runs, those whose nodes have run here."""
     policy: str | None = None
     """The active one."""
     isolation: str | None = None
@@ -124,7 +124,7 @@ def _look(spool: Path, robot: str | None, clock: Clock) -> Page:
     names = [robot] if robot else robots(spool) or [default_robot(os.environ)]
     found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each.running), found[0])
-    others = tuple(each.robot for each in found if each.running and each is not chosen)
+    others = tuple(each.robot for each in found if each.running == chosen.running and each is not chosen)
     folder = PolicyFolder(the_home())
     findings = list(chosen.findings)
     if follows_signers(folder.path) and (stale := why_stale(folder.path, clock.wall_ns())):
@@ -178,7 +178,8 @@ def view(page: Page, console: Console) -> list[RenderableType]:
     if not report.findings:
         parts.append(Text(_fine(node.topics), 'green'))
     if page.others:
-        parts.append(plain(f'Also running here: {", ".join(page.others)} (--robot NAME)', 'dim'))
+        also = 'Also running here' if report.running else 'Not running either'
+        parts.append(plain(f'{also}: {", ".join(page.others)} (--robot NAME)', 'dim'))
     return parts
 
 

@@ -67,7 +67,7 @@ __all__ = [
 ]  # fmt: skip
 
 DEFAULT_ROBOT: Final = 'thor'
-"""The Go2 of the integration guide."""
+"""The name of a Go2 in the documentation, and of its folder in the bucket."""
 GO2_PACKAGES: Final = ('go2_interfaces', 'unitree_go')
 """Message packages of a Go2's driver, and of the robot itself."""
 MIN_RATE_HZ: Final = 1e-4
@@ -187,7 +187,7 @@ def endpoint_url(given: str, name: str = ENDPOINTS[1]) -> str:
     match = _ENDPOINT.fullmatch(given)
     if match is None or int(match['port'] or 0) > MAX_PORT:
         shown = given if '@' not in given else NOT_SHOWN
-        raise SettingError(name, shown, 'a URL such as http://TOWER_IP:9000, without blanks, user, password and query')
+        raise SettingError(name, shown, 'a URL such as http://SERVER:9000, without blanks, user, password and query')
     return given.rstrip('/')
 
 

@@ -19,7 +19,7 @@ from shadowhound_data_logger.spool.local_robot import local_robot, local_robots
 
 S3_PORT: Final = 9000
 MLFLOW_PORT: Final = 5001
-"""The ports of a Tower as in the integration guide."""
+"""The ports of S3 and MLflow on a server as docs/tower.md makes it."""
 
 
 def make(

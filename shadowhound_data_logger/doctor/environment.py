@@ -22,8 +22,8 @@ from shadowhound_data_logger.spool import status
 KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')
 SHARED: Final = (*ENDPOINTS, *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL', 'ROS_DOMAIN_ID')
 """Variables that should be the same for the node and this shell; AWS keys among them are compared, never shown."""
-PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from the server', '...')
-"""Placeholders of the guide, left in a variable by copying a command."""
+PLACEHOLDERS: Final = ('<', '//SERVER', 'TOWER_IP', 'from the server', '...')
+"""Placeholders of the documentation, left in a variable by copying a command."""
 OF_THE_NODE: Final = 'set -a; . /etc/shadowhound/logger.env; set +a'
 """Loads the variables of the node's service into a shell."""
 _BARE: Final = re.compile(r'[\w.-]+:\d{2,5}/?')
@@ -81,7 +81,7 @@ def _no_endpoint(context: Context) -> Result:
         'environment.endpoint',
         'AWS_ENDPOINT_URL is not set',
         f'without it nothing is uploaded: data is stored in {context.settings.store.directory}',
-        'export AWS_ENDPOINT_URL=http://TOWER_IP:9000',
+        'export AWS_ENDPOINT_URL=http://SERVER:9000',
     )
 
 
@@ -132,14 +132,14 @@ def _tracking(context: Context) -> Iterator[Result]:
             'environment.tracking',
             'MLFLOW_TRACKING_URI is not set, though there is a server',
             f'missions are logged to {context.settings.home / "mlflow.db"}, where the server cannot see them',
-            'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
+            'export MLFLOW_TRACKING_URI=http://SERVER:5001',
         )
     elif uri.startswith('http') and services.mlflow(context) is None:
         yield error(
             'environment.tracking',
             f'MLFLOW_TRACKING_URI is {services.without_login(uri)}, which is not an address',
             'its host or port is invalid',
-            'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
+            'export MLFLOW_TRACKING_URI=http://SERVER:5001',
         )
     elif _BARE.fullmatch(uri):
         yield error(

@@ -79,7 +79,7 @@ def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
     if 'Host header' in text:
         cause, remedy = (
             'MLflow only accepts requests for its own host names',
-            'on the server: mlflow server --allowed-hosts TOWER_IP:5001,...',
+            'on the server: mlflow server --allowed-hosts SERVER:5001,...',
         )
     elif status == 401 and not text.startswith('<'):
         return error(
@@ -98,7 +98,7 @@ def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
             f'on the server: make tower-secrets TOWER_ARGS="--robot {robot}", start MLflow again, and copy {robot}.env here',
         )
     elif 400 <= status < 500 or 'like an MLflow server' in str(problem):
-        cause, remedy = 'something else listens on this port', f'export {variable}=http://TOWER_IP:5001'
+        cause, remedy = 'something else listens on this port', f'export {variable}=http://SERVER:5001'
     elif status >= 500:
         cause, remedy = 'the server fails: its database cannot be reached, or has another version', f'{LOGS} ; docker compose ps'
     return error('mlflow.answer', str(problem), cause, remedy)
@@ -198,7 +198,7 @@ def _direct(location: str, context: Context) -> Iterator[Result]:
             'mlflow.artifacts',
             f'artifacts are stored in {location}, and MLFLOW_S3_ENDPOINT_URL does not name its server',
             'MLflow then uses Amazon',
-            'export MLFLOW_S3_ENDPOINT_URL=http://TOWER_IP:9000',
+            'export MLFLOW_S3_ENDPOINT_URL=http://SERVER:9000',
         )
         return
     settings = replace(context.settings.store, endpoint_url=endpoint)

@@ -54,7 +54,7 @@ def _check(service: TowerService | None, check: str, context: Context) -> Iterat
             f'the name {service.host} cannot be resolved ({problem})',
             'no DNS server resolves it, or none can be reached: no WiFi, or not the network of the server',
             f'getent hosts {service.host}; or use the IP address of the server: '
-            f'export {service.variable}=http{"s" * service.tls}://TOWER_IP:{service.port}',
+            f'export {service.variable}=http{"s" * service.tls}://SERVER:{service.port}',
         )
         return
     yield ok(f'{check}.dns', f'{service.host} is {" and ".join(addresses)}')

@@ -210,7 +210,7 @@ def _latency(requests: S3Requests, bucket: str, robot: str) -> Result:
         's3.latency',
         f'a small request takes {1000 * middle_s:.1f} ms',
         'a weak WiFi signal, or a busy server',
-        'ping -c 10 TOWER_IP ; iw dev wlan0 link',
+        'ping -c 10 SERVER ; iw dev wlan0 link',
         is_fine=middle_s <= SLOW_S,
         latency_s=round(middle_s, 4),
     )

@@ -58,7 +58,7 @@ MAX_POINTS: Final = 1000
 """MLflow's limit for a batch."""
 _Batch = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
 """Points, params and tags."""
-S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server, such as http://TOWER_IP:9000'
+S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server, such as http://SERVER:9000'
 _USER: Final = re.compile(r'//[^/\s]*@')
 
 
@@ -118,7 +118,7 @@ class MlflowTracking:
             with self._translated('cannot be used'):  # creates SQLite's tables
                 self._client = MlflowClient(tracking_uri=self._uri)
         except TrackingRefused as error:  # nothing was sent yet: this MLflow does not support the address
-            remedy = 'set MLFLOW_TRACKING_URI to a server, http://TOWER_IP:5001; for sqlite: also install mlflow'
+            remedy = 'set MLFLOW_TRACKING_URI to a server, http://SERVER:5001; for sqlite: also install mlflow'
             raise TrackingUnavailable(f'{error}', remedy=remedy) from error
 
     def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:

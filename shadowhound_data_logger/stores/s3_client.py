@@ -114,7 +114,7 @@ def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -
                                        verify=trust)  # fmt: skip
     except ValueError as error:
         endpoint = public_url(settings.endpoint_url or '')
-        raise SettingError('AWS_ENDPOINT_URL', endpoint, 'a URL such as http://TOWER_IP:9000') from error
+        raise SettingError('AWS_ENDPOINT_URL', endpoint, 'a URL such as http://SERVER:9000') from error
     except ProfileNotFound as error:
         raise no_profile(error) from error
     except BotoCoreError as error:

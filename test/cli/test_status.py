@@ -312,7 +312,7 @@ def test_without_a_node_the_spool_is_shown(tmp_path: Path) -> None:
 
 
 def test_status_shows_the_robot_whose_node_runs(tmp_path: Path) -> None:
-    """The one that runs, unless one is asked for by option or environment; others that run are named."""
+    """The one that runs, unless one is asked for by option or environment; others that run are named, or all if none does."""
     write(tmp_path, robot='rex', ended=True)
     write(tmp_path, robot='tachi')
     write(tmp_path, robot='thor')
@@ -321,6 +321,9 @@ def test_status_shows_the_robot_whose_node_runs(tmp_path: Path) -> None:
     assert 'Also running here: thor' in text
     assert run(tmp_path, '--robot', 'rex').stdout.startswith('rex  not running')
     assert run(tmp_path, SHADOWHOUND_ROBOT='thor').stdout.startswith('thor  running')
+    for robot in ('tachi', 'thor'):
+        write(tmp_path, robot=robot, ended=True)
+    assert 'Not running either: tachi, thor' in run(tmp_path).stdout
 
 
 @pytest.mark.parametrize('arguments', [['--robot', '../x'], ['--interval', '0'], ['--nonsense']])

@@ -191,7 +191,7 @@ def test_secrets_are_not_shown() -> None:
 
 def test_an_endpoint_is_a_url() -> None:
     """An endpoint without a scheme is refused with its name."""
-    with pytest.raises(SettingError, match=r"AWS_ENDPOINT_URL = 'tower:9000'.*http://TOWER_IP:9000"):
+    with pytest.raises(SettingError, match=r"AWS_ENDPOINT_URL = 'tower:9000'.*http://SERVER:9000"):
         load({'AWS_ENDPOINT_URL': 'tower:9000'})
 
 

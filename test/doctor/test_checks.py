@@ -235,7 +235,7 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'no MLflow': (without('MLFLOW_TRACKING_URI'), 'environment', 'environment.tracking', ('export MLFLOW_TRACKING_URI=http://',)),
     'MLflow without http://': (wrong('MLFLOW_TRACKING_URI', 'tower:5001'), 'environment', 'environment.tracking',
                                ('export MLFLOW_TRACKING_URI=http://tower:5001',)),
-    'pasted as it was': (wrong('MLFLOW_TRACKING_URI', 'http://TOWER_IP:5001'), 'environment', 'environment.placeholder',
+    'pasted as it was': (wrong('MLFLOW_TRACKING_URI', 'http://SERVER:5001'), 'environment', 'environment.placeholder',
                          ('export MLFLOW_TRACKING_URI=',)),
     'a blank after the store for artifacts': (wrong('MLFLOW_S3_ENDPOINT_URL', 'http://127.0.0.1:1 '), 'environment',
                                               'environment.artifacts', ('without blanks',)),

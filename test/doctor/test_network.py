@@ -83,7 +83,7 @@ FAULTS: dict[str, tuple[Inject, str, tuple[str, ...]]] = {
     'wrong port': (nobody_there('AWS_ENDPOINT_URL'), 'network.s3.tcp', ('ss -ltnp', 'docker compose ps')),
     'hung server': (hanging('AWS_ENDPOINT_URL'), 's3.answer', ('docker compose logs',)),
     'no S3 server on this port': (imitated(answer=(200, b'<html>Welcome</html>')), 's3.answer', ('curl -i',)),
-    'name that is none': (keys(AWS_ENDPOINT_URL='http://tower.invalid:9000'), 'network.s3.dns', ('getent hosts', 'TOWER_IP')),
+    'name that is none': (keys(AWS_ENDPOINT_URL='http://tower.invalid:9000'), 'network.s3.dns', ('getent hosts', '//SERVER')),
     'missing bucket': (bucket_of_another_name, 's3.bucket', ('s3 mb s3://imu-data', '--fix')),
     'skewed clock': (fronted(Fault.SKEWED), 's3.clock', ('timedatectl',)),
     'server that ignores If-None-Match': (fronted(condition=Condition.OVERWRITES), 's3.condition', ('update the S3 server',)),
