@@ -8,15 +8,11 @@ The spool and the ledger under ``kill -9``: what commit returned stays, nothing 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-import random
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from profiles import LONG
 from spool.child import started
 from spool.conftest import Moments, Open
 from spool.making import (
@@ -336,41 +332,6 @@ def test_a_kill_at_any_moment_of_a_start_is_recovered(root: Path, moments: Momen
     for copy in died:
         reopened_spool(copy).close()
         assert settled(copy) == expected, copy.name
-
-
-@pytest.mark.long('kills')
-@pytest.mark.sampled
-def test_random_kills_lose_nothing(opened: Open, root: Path) -> None:
-    """Killed at random moments again and again: what was told as durable is there, whole, once, and the ledger closes."""
-    rng = random.Random(11)
-    durable: dict[str, str] = {}
-    delivered: set[str] = set()
-    kills = 0
-    while kills < (24 if LONG else 6) or len(durable) <= 50:  # a busy machine has done little when it is killed so soon
-        kills += 1
-        with started('load', root) as child:
-            assert child.stdout is not None
-            lines = [child.stdout.readline()]
-            time.sleep(rng.uniform(0.0, 0.12))  # the moment of death, not a wait for anything
-            child.kill()
-            lines += child.stdout.readlines()
-        for said in map(json.loads, lines):
-            durable.update(said.get('committed', []))
-            delivered.update(said.get('settled', []))
-        spool = opened()
-        check(root, durable, delivered)
-        spool.close()
-    topic = assert_whole(root)['topics']['/camera']
-    assert topic['open'] == 0
-    assert topic['accounting'] == 'exact'
-
-
-def check(root: Path, durable: dict[str, str], delivered: set[str]) -> None:
-    """What was told is true, and the spool whole."""
-    assert_whole(root)
-    table: dict[str, dict[str, Any]] = {row['key']: row for row in rows(root)}
-    assert {key: table[key]['sha256'] for key in durable} == durable
-    assert {table[key]['state'] for key in delivered} <= {'delivered', 'quarantined'}
 
 
 def test_a_running_session_is_not_settled(opened: Open, root: Path) -> None:
