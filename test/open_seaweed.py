@@ -1,4 +1,4 @@
-"""A SeaweedFS as it starts by itself, without keys and certificate: what tests of closed ones have to fail against."""
+"""A SeaweedFS with its defaults, without keys and certificate: attacks must succeed against it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Docstrings and comments are in plain English: idioms that this project had do not return.
-
-The help of every verb and option is in plain English: idioms that this project had do not return.
-"""
+"""Docstrings, comments and the help of every verb are in plain English: idioms that this project had do not return."""
 
 from __future__ import annotations
 

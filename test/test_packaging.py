@@ -1,4 +1,4 @@
-"""What is said in several files of the package is the same in all of them."""
+"""Facts that several files of the package state are the same in all of them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Bags of other recorders: the contents of their files count, and data that is not decoded is copied verbatim.
-
-SQLite bags of every version of rosbag2, as its own storage makes the tables, and every version of metadata.yaml.
-"""
+"""Bags of other recorders in MCAP and SQLite: their files count, and data that is not decoded is copied verbatim."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags that lie about their sizes, are deeper than any, or are programs: each reader says so in little memory, and by itself."""
+"""Descriptions of bags whose sizes are false, whose metadata is too deep, or that contain SQL: an error in little memory."""
 
 from __future__ import annotations
 

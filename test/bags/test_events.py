@@ -1,7 +1,4 @@
-"""An event's bag has the seconds before its trigger and after it, each message once, and the ledger says what it lacks.
-
-What a disk that hangs or is full, a folder that cannot be made, and a kill cost an event: as little as can be, and counted.
-"""
+"""The bag of an event has the seconds before and after its trigger, each message once; the ledger lists what it lacks."""
 
 from __future__ import annotations
 

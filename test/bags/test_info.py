@@ -1,7 +1,4 @@
-"""Every variant of the MCAP project's conformance tests through every verb that reads a bag: info, cut, verify, upload, fetch.
-
-MCAP files that the format allows and few writers make, assembled record by record; and files that it does not allow.
-"""
+"""Every variant of MCAP files, of the conformance tests and assembled by hand, through info, cut, verify, upload and fetch."""
 
 from __future__ import annotations
 

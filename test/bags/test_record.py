@@ -1,4 +1,4 @@
-"""``record_and_upload_rosbag``: a bag by hand, in a process of its own, from real publishers into the store."""
+"""``record_and_upload_rosbag``: a bag is recorded on request, in a separate process, from real publishers into the store."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Recovery at startup if the index was lost or another program put files into the folder.
-
-Whatever is in a bag's folder at startup: nothing outside is touched, the node starts, and other bags are completed.
-
-A bag that starts before the clock is set gets its start date later, or a name without a date.
-"""
+"""Recovery at startup: after a lost index, with foreign files in the folder, and for bags that wait for the clock."""
 
 from __future__ import annotations
 

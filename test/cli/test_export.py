@@ -1,4 +1,4 @@
-"""``shadowhound-data export`` on two machines that share a store: nobody's episode is lost, and one that is taken out is gone."""
+"""``shadowhound-data export`` on two machines that share a store: no episode is lost, and a dropped one is gone."""
 
 from __future__ import annotations
 

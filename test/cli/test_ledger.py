@@ -1,7 +1,4 @@
-"""``shadowhound-data ledger`` on spools and ledgers made here: what it prints, how wide, and its exit codes.
-
-``shadowhound-data ledger --verify`` on spools and folders made here: what it prints, where it goes on, its exit codes.
-"""
+"""``shadowhound-data ledger`` on spools and ledgers made here: output, width and exit codes, also with ``--verify``."""
 
 from __future__ import annotations
 

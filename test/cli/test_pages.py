@@ -1,7 +1,4 @@
-"""docs/parameters.md and docs/commands.md say what the code says.
-
-Commands that documents, remedies and messages tell somebody to type: verbs, options, services and parameters exist.
-"""
+"""The generated pages agree with the code, and every command in a document, remedy or message exists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Questions about values, words and labels on the command line: what is printed, and what an answer says of its own limits."""
+"""Queries by values, words and labels on the command line: their output, and what an answer states about its own limits."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Whether the clock is set, and when it steps, is seen by the boot clock and said once.
-
-The one rule by which objects, bags and missions of before the clock was set get their date, or go without one.
-"""
+"""Whether the clock is set, and when it steps, is found with the boot clock and logged once; offsets date what came before."""
 
 from __future__ import annotations
 

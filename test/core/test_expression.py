@@ -1,4 +1,4 @@
-"""The expression language: what is valid is parsed as it was meant, anything else names the position and what is allowed."""
+"""The expression language: valid expressions are parsed; all others name the position and what is allowed."""
 
 from __future__ import annotations
 

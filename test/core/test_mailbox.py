@@ -1,4 +1,4 @@
-"""Whatever stands in a mailbox: an entry is refused, or it is a request that says the same again."""
+"""Whatever a mailbox contains, an entry is refused, or it is a request that round-trips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The few requests to MLflow by hand: a hostile server gets no password for somebody else, and breaks nothing."""
+"""The few requests to MLflow without its client: a hostile server gets no password and breaks nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rules: what they say, what they ask, and what a bad one is told."""
+"""Rules: their results, their topics, and the errors of invalid ones."""
 
 from __future__ import annotations
 

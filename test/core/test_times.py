@@ -1,4 +1,4 @@
-"""Times as people write them become nanoseconds, by one grammar wherever one is asked for."""
+"""Times as people write them become nanoseconds, by one grammar everywhere."""
 
 from __future__ import annotations
 

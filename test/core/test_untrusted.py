@@ -1,9 +1,4 @@
-"""CSV files from spreadsheets: with a byte order mark, in UTF-16, or with other separators, in every reader that there is.
-
-Documents whose lists and objects lie in one another more often than Python's stack is deep.
-
-No key, name of a file or bucket that a robot wrote leads out of the folder that is read or written.
-"""
+"""Untrusted input: files of spreadsheets in any encoding, documents of any depth, and keys that lead out of a folder."""
 
 from __future__ import annotations
 

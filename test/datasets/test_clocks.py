@@ -1,4 +1,4 @@
-"""A robot and an arm, two machines with clocks of their own: what is in a frame belongs together, or the episode is refused."""
+"""A robot and an arm with separate clocks: the values of a frame belong together, or the episode is refused."""
 
 from __future__ import annotations
 

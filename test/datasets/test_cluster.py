@@ -1,4 +1,4 @@
-"""Missions exported side by side by Ray's workers have the bytes that this machine alone gives them, whoever dies meanwhile."""
+"""Missions exported in parallel by Ray's workers have the bytes of a local export, whichever worker is killed."""
 
 from __future__ import annotations
 

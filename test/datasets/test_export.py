@@ -1,7 +1,4 @@
-"""A dataset has what each mission recorded, as it was known at each tick, and says what is missing and where it came from.
-
-Killed anywhere and run again, an export and a drop give the files that they would have given.
-"""
+"""A dataset has what each mission recorded, as known at each tick, states gaps and sources, and survives kills."""
 
 from __future__ import annotations
 

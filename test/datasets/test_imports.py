@@ -1,4 +1,4 @@
-"""Recordings of an arm that others made: imported they are sources like ours, and beside a robot they are episodes."""
+"""Recordings of an arm by other programs: imported, they are sources like ours; next to a robot they are episodes."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Of which bag, or of which objects, an episode is made: of those of the mission's own time, its own bags first.
-
-Where a bag has more of a sensor than the objects have, the dataset is made of the bag, and says so.
-"""
+"""The bag or the objects from which an episode is made: of the mission's own time, its own bags first."""
 
 from __future__ import annotations
 

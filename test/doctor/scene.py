@@ -1,4 +1,4 @@
-"""A machine to examine: its variables, its folders, and a /proc of its own where that matters."""
+"""A machine to examine: its variables, its folders, and a separate /proc where that matters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recorded bags as they lie in a store, read by other libraries than the one that wrote them."""
+"""Recorded bags in a store, read by other libraries than the one that wrote them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The real node over real DDS against a real S3 server: a ROS domain and a robot's name of its own for each test."""
+"""The real node over real DDS against a real S3 server: each test has its own ROS domain and robot name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two machines in one network, made of namespaces; the one that is the robot has a second interface, with nobody on it."""
+"""Two machines in one network, made of namespaces; the robot has a second interface without a peer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Robots that are not ours, with content that can be looked at, and the logger and its page beside them."""
+"""Robots of other vendors with content that can be looked at, and the logger and its page next to them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Somebody who operates a running node by ROS's own means: services, parameters and ``/diagnostics``."""
+"""An operator of a running node by ROS's own means: services, parameters and ``/diagnostics``."""
 
 from __future__ import annotations
 

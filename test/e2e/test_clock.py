@@ -1,4 +1,4 @@
-"""A robot that starts in 1970 and learns the time later: what it stored meanwhile gets its date, by a restart as well."""
+"""A robot that starts in 1970 and gets the time later: objects stored before that are dated then, also after a restart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events of the node: the seconds before a trigger and after it are in a bag of their own, whoever triggered."""
+"""Events of the node: the seconds before and after a trigger are in a separate bag, whatever triggered it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong with a store is said so that an operator can act on it, nothing is lost, and delivery goes on by itself."""
+"""A fault of the store is reported so that an operator can act on it; nothing is lost, and delivery resumes automatically."""
 
 from __future__ import annotations
 

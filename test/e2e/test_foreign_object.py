@@ -1,4 +1,4 @@
-"""A key that holds other content already, on a real server: it stays as it is, and our object is set aside and named."""
+"""A key with other content on a real server is not overwritten; our object is quarantined and named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beside another RMW the front stands for the node: it answers as the node itself would, and lives as long as the node does."""
+"""With another RMW the front represents the node: it answers as the node would, and runs as long as the node does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The default settings and the simulated Go2: all that it published is in the store as it was, and all is accounted for."""
+"""The default settings and the simulated Go2: everything published is in the store unchanged and accounted for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""With what Humble's rclpy offers the node stores all the same, and says what it cannot know there."""
+"""With what Humble's rclpy offers the node stores everything, and reports as unknown what it cannot count."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A mission beside a running node: what the robot says is logged to it, and what is stored meanwhile carries its id."""
+"""A mission next to a running node: the robot's values are logged to it, and objects of its time carry its id."""
 
 from __future__ import annotations
 

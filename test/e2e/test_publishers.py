@@ -1,6 +1,6 @@
-"""Publishers in processes of their own, a node and a store: all they send after the match is stored, and once.
+"""Publishers in separate processes, a node and a store: everything sent after the match is stored once.
 
-Publishers of every kind, in the test's own process, are in test/node/intake/test_intake.py.
+Publishers of every kind in the test's own process are in test/node/intake/test_intake.py.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Each thread of the real node dies, in a round or for good: seen within a second, started again, counted; nothing is lost."""
+"""Any thread of the real node fails or ends: detected within a second, restarted and counted; nothing is lost."""
 
 from __future__ import annotations
 

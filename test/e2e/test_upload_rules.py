@@ -1,4 +1,4 @@
-"""A node that uploads only while a rule holds: what waits is there, is told, and goes once the rule holds."""
+"""A node that uploads only while a rule holds: waiting objects are reported, and are sent once the rule holds."""
 
 from __future__ import annotations
 

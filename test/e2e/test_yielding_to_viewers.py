@@ -1,4 +1,4 @@
-"""Uploads yield while somebody watches from another machine, and no longer: a real node, and the page in a network of its own."""
+"""Uploads yield to viewers on other machines, and no longer than that: a real node, and the page in a separate network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A viewer of the live page without a browser: ``watcher.py URL TOKEN`` tells the cap of uploads, as often as figures come."""
+"""A viewer of the live page without a browser: ``watcher.py URL TOKEN`` prints the cap of uploads with every status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many bad days, each by a seed of its own: in virtual time, or over real sockets to a real server."""
+"""Many bad days, each with its own seed: in virtual time, or over real sockets to a real server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests that go on to the real server: as they came, slower, without their condition, or of another time."""
+"""Requests that are forwarded to the real server: unchanged, slower, without their condition, or with another date."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""The one call of the encode stage: it counts every sample, names the object, and never raises for what it is given.
-
-Hostile messages through every encoder: accounted for, in bounded memory and time, and nothing but that.
-
-The examples of docs/formats.md open what the encoder makes.
-"""
+"""The encoders count every sample, name the object and never raise, also for hostile messages; examples of the page."""
 
 from __future__ import annotations
 

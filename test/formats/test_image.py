@@ -1,9 +1,4 @@
-"""JPEGs pass through untouched, raw colors become JPEGs that look the same, and contradictory images are rejected by reason.
-
-Images of every encoding of ROS become pictures that look the same in other libraries, or are stored bit for bit.
-
-PNGs pass through untouched, and what is made without loss (PNG, TIFF) reads back bit for bit, depth among it.
-"""
+"""Images of every encoding look the same in other libraries, or are stored bit for bit."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What ROS itself serializes is decoded to what was put in: the definitions and the CDR reader agree with the middleware.
-
-Definitions are found, decode what they describe, and turn hostile bytes into Rejected.
-"""
+"""Message definitions are found and decode what ROS serialized; hostile bytes are rejected."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""One robot's bad part of the catalogue is left out, named and counted; the others are answered by every command.
-
-One robot's bad part of the gap journal is left out, named and counted; what the others told is answered by every command.
-"""
+"""A robot's bad part of the catalog or of the gap journal is skipped, named and counted; every command answers with the rest."""
 
 from __future__ import annotations
 

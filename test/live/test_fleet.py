@@ -1,4 +1,4 @@
-"""All robots of a store at a glance: what is known of each, in which order, and the table of them in a real Chromium."""
+"""All robots of a store at a glance: the state of each, their order, and the table in a real Chromium."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""MissionDataLogger as the agent uses it: nothing it says is lost, and nothing that goes wrong reaches the mission.
-
-The lifecycle of a logger: its thread and files, forks, and closing.
-"""
+"""The logger of an agent: its calls, its failures, its lifecycle, forks and closing."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""A mission's objects in a real spool: each once, held until their run is known, delivered where no node does.
-
-Objects that an agent delivers without a node are in the catalog, and a node's frames have the pose of the robot.
-
-A spool whose index another process locks for seconds: this delays only the delivery, not the calls of an agent.
-"""
+"""Objects of missions: spooled once, delivered and cataloged without a node, and delayed by a busy index only."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""Tracking without a server: a SQLite file, which is the default, and a folder; what each keeps once.
-
-Missions against a real MLflow server and a real S3 server, through the process that sends them.
-
-Missions and every kind of tracking server that is promised, each the real thing: PostgreSQL behind it, and MLflow 2.x.
-
-``SHADOWHOUND_MLFLOW2`` names a virtual environment with ``mlflow<3``, ``boto3`` and ``rosbags``.
-"""
+"""Missions against every kind of MLflow server that is promised, each the real one."""
 
 from __future__ import annotations
 

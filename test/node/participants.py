@@ -1,4 +1,4 @@
-"""Programs that take part in ROS as others see them, in the process of the test: each is a DDS participant of its own."""
+"""Programs that take part in ROS, in the process of the test: each is a separate DDS participant."""
 
 from __future__ import annotations
 

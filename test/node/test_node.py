@@ -1,4 +1,4 @@
-"""What systemd is told, by a socket such as it makes."""
+"""Notifications to systemd, over a socket like its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What code inside the smoke run can do to the robot: it runs here as an ordinary user, whose home it attacks."""
+"""The smoke run: what it refuses, and what code inside it can do to the robot."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a robot refuses to run, each for its own reason; whatever it is, the version that was active stays.
-
-Policies over a bad link: 100 MB over a connection that is cut 20 times, and no faster than the cap.
-"""
+"""What a robot refuses to activate, each for a separate reason; the active version stays. Transfers over bad links."""
 
 from __future__ import annotations
 

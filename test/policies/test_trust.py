@@ -1,4 +1,4 @@
-"""What a thief of keys, and who holds the store, can do to a robot: the attacks of The Update Framework, and our own.
+"""What an attacker with stolen keys, or with the store, can do to a robot: the attacks of The Update Framework, and our own.
 
 https://theupdateframework.github.io/specification/latest/#goals-to-protect-against-specific-attacks
 """

@@ -1,4 +1,4 @@
-"""Ports of killed listeners: what is settled in them, what is left alone, and that a publisher goes on."""
+"""Ports of killed listeners: what is changed in them, what is left alone, and that publishers continue."""
 
 from __future__ import annotations
 

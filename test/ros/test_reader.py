@@ -1,7 +1,4 @@
-"""Message packages that cannot be used here cost their own topics alone.
-
-What the reader asks of rclpy beyond its documented interface is there (the list in ros/reader.py).
-"""
+"""The reader of topics, and what it needs of rclpy beyond its documented interface (the list in ros/reader.py)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot that keeps things, a mailbox, and somebody who asks."""
+"""A robot that keeps data, a mailbox, and a client that requests data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A spool that is a dict, and a clock that stands still until it is told to move."""
+"""A spool that is a dict, and a clock that the test moves."""
 
 from __future__ import annotations
 

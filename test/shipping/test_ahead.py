@@ -1,7 +1,4 @@
-"""What is made while a backlog is delivered: it is served beside it, and the backlog beside what is live.
-
-How a backlog and what is live share a store that cannot take both at once, by simulation.
-"""
+"""New data and a backlog are delivered next to each other, also by a store that is too slow for both."""
 
 from __future__ import annotations
 

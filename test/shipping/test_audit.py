@@ -1,4 +1,4 @@
-"""An audit of every store: what was delivered is asked for, and whatever happened to it since is found."""
+"""An audit of every store requests each delivered object, and finds whatever happened to it since."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The robot's side of the catalog: every delivered object in exactly one part, at the time that was asked for.
-
-The gap journal on its way out: every change in a part, with watermarks behind it, across deaths, retries and new indexes.
-"""
+"""The robot's side of the catalog and of the gap journal: each object in one part, each gap with its watermark."""
 
 from __future__ import annotations
 

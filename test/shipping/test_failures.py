@@ -1,4 +1,4 @@
-"""A store that answers no: to the credentials, to a bucket, to an object. Each holds up no more than it must."""
+"""A store that refuses credentials, a bucket or an object: each delays no more than it must."""
 
 from __future__ import annotations
 

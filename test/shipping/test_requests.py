@@ -1,4 +1,4 @@
-"""What a robot keeps is sent when somebody asks for it, and every request is answered."""
+"""Kept data is sent when it is requested, and every request is answered."""
 
 from __future__ import annotations
 

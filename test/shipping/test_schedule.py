@@ -1,11 +1,4 @@
-"""What is shipped next, by whom, and when all is delivered.
-
-Delivery under a cap: a thread is kept for what is more important, the cap can change, and a stop does not wait for it.
-
-Slices in the queue: large objects never have all threads, so what is live waits for none of them.
-
-A store that is away: one probe at a time, ever more rarely, said once, and nothing is given up.
-"""
+"""The order of uploads, their threads under a cap and with large objects, probes during an outage, and when all is delivered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Of slices that reach beyond the time that is asked for a bag of that time is cut, and sent in their place."""
+"""Slices that extend beyond the requested time are cut, and the cut is sent in their place."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What waits for a rule waits, and nothing else does: with the real spool, however much waits.
-
-Which objects of a real spool leave first.
-
-Threads of delivery that die: what they held is sent again, and the death is counted.
-"""
+"""Deliveries with real threads and a real spool: after outages, failures, kills and random faults each object arrives once."""
 
 from __future__ import annotations
 

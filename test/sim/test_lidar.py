@@ -1,4 +1,4 @@
-"""Scans are made of the building that the robot stands in."""
+"""Scans are made of the building around the robot."""
 
 from __future__ import annotations
 

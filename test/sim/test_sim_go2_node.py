@@ -1,9 +1,4 @@
-"""The simulated Go2 as its users meet it: a process that publishes over real DDS.
-
-Samples come in order, none left out.
-
-The simulated Go2's parameters, and the loop that publishes what is due.
-"""
+"""The simulated Go2: a process that publishes over real DDS, its schedule and its parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A spool in a folder of its own, with a clock that the test owns."""
+"""A spool in a separate folder, with a clock that the test owns."""
 
 from __future__ import annotations
 

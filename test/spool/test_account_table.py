@@ -1,4 +1,4 @@
-"""Objects that hold messages of several topics, in accounts of a sink of its own, and what an earlier session left open there."""
+"""Objects with messages of several topics, in accounts of a separate sink, and the open messages of earlier sessions."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Whatever happened to a spool's folder, a start works, ships nothing damaged, loses no whole file and says what it found.
-
-Files that the spool did not write: adopted where they can be objects, never followed, overwritten or lost.
-
-An index that is lost, damaged, old or new: it is rebuilt from the files, or refused and left alone.
-"""
+"""Files without rows: a lost or damaged index is rebuilt; foreign files are adopted or set aside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A spool on a real file system that somebody else fills up, or that may not be written: it waits, tells once, and goes on."""
+"""A spool on a real file system that is full or read-only: it waits, reports once, and resumes."""
 
 from __future__ import annotations
 

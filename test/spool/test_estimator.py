@@ -1,4 +1,4 @@
-"""Estimates of what was lost, against simulated streams of which the truth is known."""
+"""Estimates of losses, compared with simulated streams."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What a start finds after a stop, a crash or an operator's hand. It never fails, and the ledger closes after it.
-
-A process that died in a commit, and the write-ahead log of the index that is gone as well or is not.
-
-The spool and the ledger under ``kill -9``: what commit returned stays, nothing is half there, and the ledger closes.
-"""
+"""Recovery at the start of a spool: after kills at any moment, lost logs and damaged files the ledger balances."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Values in an index that cannot be ours are found at the start, before they end it or lead out of the spool.
-
-A home that a newer program wrote is refused and not changed.
-"""
+"""Implausible values in an index are found at the start; a home that a newer program wrote is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grades belong to sessions: what is known of each and what is estimated."""
+"""Grades belong to sessions: what each knows and what it estimates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A commit that hangs in the disk: what waits is still told, and the end is reached all the same."""
+"""Commits, keys, outcomes and order of the spool; a hung commit blocks neither readers nor the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objects of before the clock was set get their date as soon as it is known, and no object gets a wrong one."""
+"""Objects stored before the clock was set are dated as soon as the offset is known, and none gets a wrong date."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""S3 stores with a secret of their own, and what they say when something is wrong."""
+"""S3 stores with a secret, and the messages of their errors."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What every store does alike.
-
-Keys that other programs made and that are no paths: a store with them is listed and read like one without.
-"""
+"""The behavior that all stores share, also with keys of other programs that are not paths."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What stands between us and an S3 store: no answer, a wrong one, damage on the way. Each is told, and passes.
-
-What an S3 store refuses (credentials, a bucket, a key), what that means for delivery, and that it never shows a secret.
-"""
+"""Faults between us and an S3 store, and its refusals: each is reported without a secret, and passes."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Which failures of an S3 client are transient, which terminal, and what each is called: row by row.
-
-Each fault alone, by the front over a real server: what the store says, and that nothing is lost, doubled or overwritten.
-"""
+"""Each failure of an S3 client has its class and its words; each fault, over a real server, loses nothing."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Objects that are sent in parts: what every store does alike, and what an S3 server is asked for.
-
-A slice on a bad day: what ends its upload costs the parts that were under way, never one that the server has.
-"""
+"""Large objects are sent in parts; what ends an upload costs only the parts in flight."""
 
 from __future__ import annotations
 

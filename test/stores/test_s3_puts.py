@@ -1,7 +1,4 @@
-"""An S3 store never overwrites, whatever its server makes of If-None-Match.
-
-What of a PUT leaves when: the cap over a real connection, and what is asked of the server before.
-"""
+"""An S3 store never overwrites, whatever its server makes of If-None-Match; how bodies are sent under a cap."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Single requests to an S3 server, through botocore's client.
-
-What a server can do to whoever reads from it: send more than it said, break listings off; what settings can.
-"""
+"""Single requests to an S3 server through botocore's client, also to hostile servers."""
 
 from __future__ import annotations
 

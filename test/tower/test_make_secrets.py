@@ -1,7 +1,4 @@
-"""The credentials of a Tower: who may read them, that they stay, and how one is changed.
-
-A robot with its own keys alone, over TLS, with the commands of the manual: all works, also while its keys are changed.
-"""
+"""The secrets of a Tower and their rotation, also while a robot works with its own keys over TLS."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Attacks on a real MLflow server of a Tower: by a stranger, with a robot's password and with Spark's; and what each is for.
-
-What a hostile robot writes into its runs, in the browser of whoever looks at MLflow's pages as Spark.
-"""
+"""Attacks on a real MLflow server of a Tower: by a stranger, with a robot's password and with Spark's, and on its pages."""
 
 from __future__ import annotations
 

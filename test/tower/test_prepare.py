@@ -1,7 +1,4 @@
-"""What the users of a Tower may do, asked of a real SeaweedFS.
-
-Large objects with a robot's own keys, on a Tower as it is set up: sent in parts, and taken up again after a kill.
-"""
+"""The rights of a Tower's users on a real SeaweedFS, also for objects sent in parts."""
 
 from __future__ import annotations
 

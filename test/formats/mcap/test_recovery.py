@@ -1,9 +1,4 @@
-"""Recovery: whatever a kill, a power cut or a bad disk made of an open slice, what was whole can be read by other readers.
-
-The contents of a complete file, from its summary: ours, and other writers' with more or less of a summary.
-
-Recovery of hostile files: it never fails, and its memory is bounded whatever they claim.
-"""
+"""Recovery of slices: after any damage or kill a slice is readable, in bounded memory; infos of complete files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""metadata.yaml: what Humble's and Jazzy's rosbag2 read from it, by the rules of their readers.
-
-Whole bags, as this package leaves them in a folder, in other people's readers: `rosbags` by folder, and with its own types.
-"""
+"""metadata.yaml as Humble's and Jazzy's rosbag2 read it, and complete bags in the reader of ``rosbags``."""
 
 from __future__ import annotations
 

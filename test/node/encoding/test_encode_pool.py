@@ -1,7 +1,4 @@
-"""The encode pool: every sample that goes in comes out as stored or as rejected.
-
-The bounded queue: never blocks, serves the most important first, and drops the least important first.
-"""
+"""The encode pool and its bounded queue: every sample is stored, rejected or dropped by priority, and counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rejected messages are reported once a minute for each topic, reason and node, with a remedy, for as long as it goes on."""
+"""Rejected messages are reported once per minute for each topic, reason and node, with a remedy."""
 
 from __future__ import annotations
 

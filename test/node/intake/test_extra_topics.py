@@ -1,4 +1,4 @@
-"""How many topics bags and events listen to, whoever makes how many: over real DDS, with the bounds made small."""
+"""The number of topics for bags and events is limited, however many exist: over real DDS, with small limits."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""The clock of the intake.
-
-Publishers of every kind, early and late, alone and together: all they send after the match is taken, and once.
-
-The intake is that of the node, in this process, over real DDS. That all of it is in the store is shown by test/e2e.
-
-A hostile neighbor on the robot's network: what it publishes with forged stamps, through DDS, rewrites no day that is over.
-"""
+"""Publishers of every kind, early and late, alone and together: everything sent after the match is taken once."""
 
 from __future__ import annotations
 

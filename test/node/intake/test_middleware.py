@@ -1,4 +1,4 @@
-"""By which RMW the node listens, decided from an environment, and what is said of it."""
+"""The RMW of the node, chosen from an environment, and the reason that is reported."""
 
 from __future__ import annotations
 

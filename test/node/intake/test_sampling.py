@@ -1,9 +1,4 @@
-"""What is sampled and batched when the clocks of a topic's publishers differ, or their stamps cannot be trusted.
-
-Batches are whole windows of UTC, bounded in time, number and size.
-
-Downsampling: which messages of a topic are kept.
-"""
+"""Sampling and batches: which messages are kept, and batches that are bounded windows of UTC."""
 
 from __future__ import annotations
 

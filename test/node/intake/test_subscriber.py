@@ -1,7 +1,4 @@
-"""A topic that is published under two types, over real DDS: what the sensor names is logged, the other is counted or told.
-
-Event topics of services and topics of actions, over real DDS: received, counted, decoded and defined like every topic.
-"""
+"""Topics with two types, and topics of services and actions, over real DDS: the configured type is logged, others are counted."""
 
 from __future__ import annotations
 

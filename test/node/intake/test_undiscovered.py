@@ -1,4 +1,4 @@
-"""What the front finds and the node does not is said once it has lasted, as far as it is known, and no more when it ends."""
+"""Publishers that the front finds and the node does not are reported after a while, until they are found or gone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rules that uploads wait for: networks as the system tells them, and topics that nobody publishes."""
+"""Rules for uploads: networks as the system reports them, and topics without a publisher."""
 
 from __future__ import annotations
 

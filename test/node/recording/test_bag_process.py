@@ -1,4 +1,4 @@
-"""What the bag process tells of its bag: the real recordings are in test/bags/test_record.py."""
+"""What the bag process reports about its bag; the real recordings are in test/bags/test_record.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the bags get of a topic: everything that came, once, in accounts of their own, whatever the sensor keeps of it."""
+"""Bags get every message of a topic once, in separate accounts, whatever the sensor keeps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What triggers by itself: a condition once for each time that it holds, and what an agent logs while it is news."""
+"""Triggers: a condition once for each time that it holds, and agent events while they are recent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the node answers to each request, with stages that do as they are told."""
+"""The node's answer to each request, with stages that the test controls."""
 
 from __future__ import annotations
 

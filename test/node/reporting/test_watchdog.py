@@ -1,4 +1,4 @@
-"""What stands still is told with its cause; what may be silent, or is told elsewhere, is not."""
+"""A stall is reported with its cause; silence that is allowed or reported elsewhere is not."""
 
 from __future__ import annotations
 
