@@ -178,13 +178,13 @@ def _rosbag2(figures: Figures) -> str:
 
     rows = [(f'{int(rate):,}/s', words[who], us(found), lost(found), f'{median(found["bytes"]):.0f}' if 'bytes' in found else '')
             for rate, recorders in figures['rates'].items() for who, found in recorders.items()]  # fmt: skip
-    parts = [_table(('messages', 'recorder', 'CPU per message', 'lost', 'bytes per message'), rows)]
+    parts = [_table(('messages', 'recorder', 'CPU per recorded message', 'lost', 'bytes per message'), rows)]
     if 'job' in figures:
         words = {'rosbag2': f'{version} and rclone', 'bag': 'the node'}
         jobs = [(words[who], us(found), f'{median(found["copy_us"]):.0f} us' if who == 'rosbag2' else '', lost(found),
                  f'{median(found["bytes"]) / 1000:,.0f} KB', f'{median(found["late_p50_s"]):.1f} s',
                  f'{max(found["late_max_s"]):.1f} s') for who, found in figures['job'].items()]  # fmt: skip
-        head = (f'recording and delivering, {figures["job_hz"]:,}/s, files of {figures["split_s"]} s', 'CPU per message',
+        head = (f'recording and delivering, {figures["job_hz"]:,}/s, files of {figures["split_s"]} s', 'CPU per stored message',
                 'of it rclone', 'lost', 'on the disk at the end', 'from publication to the store, median', 'maximum')  # fmt: skip
         parts.append(_table(head, jobs))
     return '\n\n'.join(parts)

@@ -1,4 +1,4 @@
-"""Recording one topic, next to ``ros2 bag record``: CPU per message, losses and bytes; and the complete job, up to the store.
+"""Recording one topic, next to ``ros2 bag record``: CPU per recorded message, losses and bytes; and all up to a store.
 
 The recorders take turns, each alone with its own publisher process; the rounds give the spread. rosbag2 runs with its defaults,
 in MCAP if it supports that, and without this package's Fast DDS profile. The node records the topic into a bag without
@@ -20,7 +20,7 @@ import shutil
 import subprocess
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -118,7 +118,7 @@ def stream(folder: Path, other: Rosbag2 | None, who: str, rate_hz: int, seconds:
         else:  # it may still be starting when the first ones arrive
             stamps, size = _stamps(bag.glob('*.mcap')), _bytes(bag)
             recorded, lost = len(stamps), sent - sum(stamp_ns >= began_ns for stamp_ns in stamps)
-    return {'us': 1e6 * used / sent, 'published': sent, 'lost': lost, 'bytes': size / max(1, recorded)}
+    return {'us': 1e6 * used / max(1, sent - lost), 'published': sent, 'lost': lost, 'bytes': size / max(1, recorded)}
 
 
 def _publisher(world: World, recorder: Program) -> Program:
@@ -158,7 +158,8 @@ class Delivery:
 
     client: Any
     copy: Sequence[str] = ()
-    """``rclone copyto`` with its options; empty if the recorder uploads."""
+    """``rclone`` with its options; empty if the recorder uploads."""
+    environ: Mapping[str, str] = field(default_factory=dict)
     bag: Path = Path()
     seen_ns: dict[str, int] = field(default_factory=dict)
     """When each key was first in the bucket."""
@@ -172,7 +173,7 @@ class Delivery:
 
     def look(self, *, is_last: bool = False) -> None:
         """``is_last``: the last file is complete as well."""
-        files = sorted(self.bag.glob('*.mcap'), key=lambda path: path.stat().st_mtime_ns) if self.copy else []
+        files = sorted(self.bag.glob('*.mcap'), key=lambda path: (len(path.name), path.name)) if self.copy else []
         for path in files if is_last else files[:-1]:
             if path.name not in self.copied:
                 self.copied[path.name] = self._copy(path)
@@ -182,7 +183,7 @@ class Delivery:
 
     def _copy(self, path: Path) -> float:
         program, *options = self.copy
-        child = subprocess.Popen([program, 'copyto', *options, str(path), f':s3:{BUCKET}/rosbag2/{path.name}'])
+        child = subprocess.Popen([program, 'copyto', *options, str(path), f':s3:{BUCKET}/rosbag2/{path.name}'], env=self.environ)
         _, status, used = os.wait4(child.pid, 0)
         if status:
             raise Failed(f'rclone failed with status {status}')
@@ -202,7 +203,7 @@ def job(folder: Path, other: Rosbag2 | None, rclone: str, seconds: float) -> dic
     """Record and deliver for a while, by one of them. The last file does not count: it ends with the recorder."""
     with World(folder) as world:
         bag = world.folder / 'rosbag2'
-        delivery = Delivery(_client(world), _copying(world, rclone) if other is not None else (), bag)
+        delivery = _delivery(world, rclone if other is not None else '', bag)
         if other is None:
             recorder, local = world.node({**RECORDED, 'bag.slice_s': float(SPLIT_S)}), world.folder / 'home'
         else:
@@ -225,24 +226,20 @@ def job(folder: Path, other: Rosbag2 | None, rclone: str, seconds: float) -> dic
     late_s = [(delivery.seen_ns[key] - stamp_ns) / SECOND for key in in_time for stamp_ns in stamps[key]]
     if not late_s:
         raise Failed(f'no file was in the store within {seconds:g} s')
-    found = sum(map(len, stamps.values()))
-    return {'us': 1e6 * (used + copies) / sent, 'copy_us': 1e6 * copies / sent, 'published': sent, 'lost': sent - found,
+    stored = sum(map(len, stamps.values()))
+    return {'us': 1e6 * (used + copies) / stored, 'copy_us': 1e6 * copies / stored, 'published': sent, 'lost': sent - stored,
             'bytes': size, 'late_p50_s': percentile(late_s, 50), 'late_max_s': max(late_s)}  # fmt: skip
 
 
-def _client(world: World) -> Any:
+def _delivery(world: World, rclone: str, bag: Path) -> Delivery:
+    """Without ``rclone``, the recorder uploads."""
     assert world.tower is not None
-    settings = world.tower.store_settings()
-    return boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
-                        aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
-
-
-def _copying(world: World, rclone: str) -> list[str]:
-    """The command with its options; the keys are passed as variables."""
-    assert world.tower is not None
-    os.environ.update({name: value for name, value in world.tower.environment().items() if name.startswith('AWS_')})
-    endpoint = ['--s3-provider', 'Other', '--s3-env-auth', '--s3-endpoint', world.tower.endpoint_url]
-    return [rclone, '--config', os.devnull, *endpoint, '--s3-force-path-style', '--s3-no-check-bucket']
+    tower, settings = world.tower, world.tower.store_settings()
+    client = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
+                          aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
+    server = ['--s3-provider', 'Other', '--s3-env-auth', '--s3-endpoint', tower.endpoint_url, '--s3-force-path-style']
+    environ = {name: value for name, value in os.environ.items() if name != 'AWS_CA_BUNDLE'} | tower.environment()
+    return Delivery(client, [rclone, '--config', os.devnull, *server] if rclone else (), environ, bag)
 
 
 # -- all of it ---------------------------------------------------------------------------------------------------------
