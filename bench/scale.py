@@ -1,6 +1,6 @@
 """Numbers for fleets of 1, 100 and 10,000 robots, from measured rates: the tables of docs/scale.md and docs/evidence/scale.md.
 
-Run it as ``python bench/scale.py`` to print them, with ``--write`` to update the pages. A test compares them.
+Run it as ``python bench/scale.py`` to print them, with ``--write`` to update the pages.
 """
 
 from __future__ import annotations
