@@ -18,8 +18,9 @@ from shadowhound_data_logger.doctor.services import CONNECT_S, TowerService
 
 GLANCE_S: Final = 0.5
 """For a port that is only a guess."""
-EXPIRED, WRONG_HOST, WRONG_ADDRESS = 10, 62, 64
-"""X509_V_ERR_CERT_HAS_EXPIRED, _HOSTNAME_MISMATCH, _IP_ADDRESS_MISMATCH of OpenSSL's x509_vfy.h; others: not trusted."""
+NOT_YET, EXPIRED, WRONG_HOST, WRONG_ADDRESS = 9, 10, 62, 64
+"""X509_V_ERR_CERT_NOT_YET_VALID, _CERT_HAS_EXPIRED, _HOSTNAME_MISMATCH, _IP_ADDRESS_MISMATCH of OpenSSL's x509_vfy.h; others: not
+trusted."""
 CA_FILES: Final = {
     's3': ('AWS_CA_BUNDLE', 'REQUESTS_CA_BUNDLE'),
     'mlflow': ('MLFLOW_TRACKING_SERVER_CERT_PATH', 'REQUESTS_CA_BUNDLE', 'CURL_CA_BUNDLE'),
@@ -169,6 +170,12 @@ def _untrusted(service: TowerService, check: str, problem: ssl.SSLCertVerificati
             f'the certificate of {service.url} has expired',
             'it was not renewed, or the clock of this machine is ahead',
             f'{shown} -dates ; date ; renew it on the server',
+        ),
+        NOT_YET: lambda: error(
+            f'{check}.early',
+            f'the certificate of {service.url} is not valid yet',
+            'the clock of this machine is behind, or that of the server was ahead when it was made',
+            f'{shown} -dates ; date ; set the clock: timedatectl',
         ),
         WRONG_HOST: lambda: error(
             f'{check}.host',

@@ -369,7 +369,10 @@ def service(request: pytest.FixtureRequest) -> tuple[str, Client]:
     return request.param, CLIENTS['MLflow' if request.param == 'mlflow' else 'delivery']
 
 
-FINDINGS = {'unknown': ('/etc/shadowhound/ca.pem',), 'expired': ('-dates', 'renew it'), 'host': ('subjectAltName',)}
+FINDINGS = {
+    'unknown': ('/etc/shadowhound/ca.pem',), 'expired': ('-dates', 'renew it'), 'early': ('-dates', 'timedatectl'),
+    'host': ('subjectAltName',),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize('kind', FINDINGS)
