@@ -302,6 +302,8 @@ def test_the_figures_are_those_of_the_ledger(page: Page, watching: Watching) -> 
 
 def test_the_age_of_a_silent_topic_is_the_publishers(page: Page, watching: Watching) -> None:
     """Within 200 ms, counted from the last message that was published, whenever that was between two polls of the node."""
+    watching.sim.signal(signal.SIGINT)
+    watching.sim.wait()
     turned = np.array([0.5])
     message = cdr(new(JOINTS, header=header(), name=['hip'], position=turned, velocity=turned, effort=turned), JOINTS)
     publisher = watching.processes.publisher()
