@@ -22,12 +22,12 @@ FEATURES = ('ch', 'mx', 'st', 'rsh', 'rch', 'ax', 'mdx', 'chx', 'sum', 'pad')
 INDEXES = {'mx': IndexType.MESSAGE, 'ax': IndexType.ATTACHMENT, 'mdx': IndexType.METADATA, 'chx': IndexType.CHUNK}
 EXTRA = b'\x01\xff\xff'
 UNPADDED = {Opcode.FOOTER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.DATA_END}
-"""Records whose last field takes the rest, or that are found by their size."""
+"""Records whose last field takes the remaining bytes, or that are found by their size."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a file is made of."""
+    """The contents of a file."""
 
     name: str
     schema: tuple[str, str, bytes] | None = None
@@ -70,7 +70,7 @@ class PaddedBuilder(RecordBuilder):
 
 
 def variants() -> Iterator[tuple[str, Recorded, bytes]]:
-    """The name of each, what is in it, and the file."""
+    """The name, contents and file of each."""
     for recorded in INPUTS:
         for count in range(len(FEATURES) + 1):
             for features in map(set, combinations(FEATURES, count)):

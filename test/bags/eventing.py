@@ -1,4 +1,4 @@
-"""What tests of events share: a ring and its writer over a spool, at a time that the test owns."""
+"""Shared by tests of events: a ring and its writer over a spool, with a clock set by the test."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def until(condition: Callable[[], Any], what: str) -> None:
 
 @dataclass(slots=True)
 class Buffer:
-    """Events with all behind them. ``hear`` is what the intake does at the present second."""
+    """Events with the complete pipeline. ``hear`` acts as the intake does at the present second."""
 
     spool: BoundedSpool
     writer: SpoolWriter
@@ -60,14 +60,14 @@ class Buffer:
         self.now_s[0] += seconds
 
     def taken(self) -> None:
-        """Wait until the writer has all that the ring had."""
+        """Wait until the writer has everything that was in the ring."""
         until(lambda: self.ring.bytes == 0, 'the writer takes what there is')
 
     def written(self, count: int = 1) -> None:
         until(lambda: self.events.status().written >= count, f'{count} events are written: {self.events.status()}')
 
     def rows(self) -> dict[str, Any]:
-        """Of the ledger, once all is committed."""
+        """The rows of the ledger, once everything is committed."""
         assert self.writer.flush(WAIT_S)
         self.spool.commit()
         found = ledger.read(self.spool.root, ROBOT)
@@ -76,7 +76,7 @@ class Buffer:
         return rows
 
     def objects(self) -> dict[str, Path]:
-        """Key below the robot's bags -> file, of all that is in the spool."""
+        """Key below the robot's bags -> file, for everything in the spool."""
         assert self.writer.flush(WAIT_S)
         start = f'{ROBOT}/rosbags/'
         return {item.key.removeprefix(start): item.path for item in self.spool.pending(1000)}
@@ -87,7 +87,7 @@ class Buffer:
 
 @contextmanager
 def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator[Buffer]:
-    """An open one, with five seconds before a trigger and two after it; closed as the node does it."""
+    """An open buffer, with five seconds before a trigger and two after it; closed as the node does it."""
     clocks = clock or Clocks()
     if clock is None:
         clocks.set()
@@ -117,7 +117,7 @@ def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator
 
 
 def only_bag(it: Buffer) -> str:
-    """The one that is there."""
+    """The only bag."""
     (bag,) = it.bags()
     return bag
 
@@ -129,7 +129,7 @@ def in_bag(it: Buffer, bag: str) -> list[int]:
 
 
 def hear_each_second(it: Buffer, seconds: range) -> None:
-    """A message each, numbered so."""
+    """One message per second, numbered accordingly."""
     for second in seconds:
         it.hear(range(second, second + 1))
         it.pass_s(1.0)

@@ -1,4 +1,4 @@
-"""Bags as this package and as rosbags write them, in folders and in stores, for the tests of what reads them."""
+"""Bags as this package and as rosbags write them, in folders and in stores, for the tests of their readers."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def write_rosbags(folder: Path, plugin: StoragePlugin, mode: CompressionMode, *,
 
 
 def stored(store: ObjectStore, folder: Path, *, robot: str = 'thor', without: str = '-') -> None:
-    """Put the files of a folder under the keys of a bag, as the node does; what has ``without`` in its name stays behind."""
+    """Put the files of a folder under the keys of a bag, as the node does; files with ``without`` in their names are skipped."""
     for place, path in enumerate(sorted(folder.iterdir())):
         if without not in path.name:
             store.put(put_item(path, f'{prefix_of(robot, folder.name)}{path.name}', folder.name, place))
 
 
 def put_item(path: Path, key: str, bag: str, place: int) -> SpooledObject:
-    """A file as delivery hands it to a store."""
+    """A file as delivery passes it to a store."""
     sha256 = fingerprint(path)[1]
     metadata = {'sha256': sha256}
     if path.suffix == '.mcap':
@@ -83,13 +83,13 @@ def put_item(path: Path, key: str, bag: str, place: int) -> SpooledObject:
 
 
 def messages_of(paths: Sequence[Path]) -> Iterator[RecordedMessage]:
-    """All messages of MCAP files, in their order."""
+    """All messages of MCAP files, in order."""
     for path in paths:
         source = LocalFile(path)
         yield from read_messages(source, read_index(source), EVER)
 
 
 def by_rosbags(folder: Path) -> list[tuple[str, int, bytes]]:
-    """What another program reads of a bag: topic, log time, CDR."""
+    """The messages of a bag according to another program: topic, log time, CDR."""
     with Reader(folder) as reader:
         return [(connection.topic, log_ns, bytes(cdr)) for connection, log_ns, cdr in reader.messages()]

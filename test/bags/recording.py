@@ -1,4 +1,4 @@
-"""What tests of the recorder share: messages as the intake hands them over, and a spool with its writer."""
+"""Shared by tests of the recorder: messages as the intake passes them on, and a spool with its writer."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ HOLD_S = 600.0
 
 
 def messages(numbers: range, size: int = 0) -> list[Taken]:
-    """Of one publisher, a hundredth of a second apart; each came a millisecond after it was sent."""
+    """Messages of one publisher, 10 ms apart; each arrived 1 ms after it was sent."""
     return [
         Taken(
             b'\0\1\0\0%08d' % number + b'x' * size,
@@ -54,7 +54,7 @@ def batch(numbers: range, topic: str = '/talk', size: int = 0, type_name: str = 
 
 
 class BoundedSpool(Spool):
-    """A spool whose disk has room for bags while the test says so."""
+    """A spool with a disk that has room for bags while the test says so."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -64,7 +64,7 @@ class BoundedSpool(Spool):
 
 @dataclass(slots=True)
 class Desk:
-    """A recorder with all behind it. What ``hear`` is given counts as received, as the intake would have it."""
+    """A recorder with the complete pipeline. Messages passed to ``hear`` count as received, as in the intake."""
 
     spool: BoundedSpool
     writer: SpoolWriter
@@ -96,7 +96,7 @@ class Desk:
             self.spool.accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)
 
     def row(self, topic: str = '/talk') -> dict[str, Any]:
-        """Of the ledger, once all is committed."""
+        """The row of the ledger, once everything is committed."""
         assert self.writer.flush(WAIT_S)
         self.spool.commit()
         found = ledger.read(self.spool.root, ROBOT)
@@ -105,7 +105,7 @@ class Desk:
         return row
 
     def objects(self) -> dict[str, Path]:
-        """Key below the robot's bags -> file, of all that is in the spool."""
+        """Key below the robot's bags -> file, for everything in the spool."""
         assert self.writer.flush(WAIT_S)
         start = f'{ROBOT}/rosbags/'
         return {item.key.removeprefix(start): item.path for item in self.spool.pending(1000)}
@@ -113,7 +113,7 @@ class Desk:
 
 @contextmanager
 def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] | None = None, **settings: Any) -> Iterator[Desk]:
-    """An open one; closed as the node does it, unless it was before. ``offsets`` is what is known of other boots' clocks."""
+    """An open desk; closed as the node does it, unless it was before. ``offsets`` are known offsets of other boots' clocks."""
     time = clock or Clocks()
     if clock is None:
         time.set()
@@ -148,7 +148,7 @@ def mission(name: str = 'patrol', number: int = 1, run_id: str | None = None) ->
 
 
 def numbers(path: Path) -> list[int]:
-    """Of the messages of a slice, in the order of the file."""
+    """The numbers of a slice's messages, in file order."""
     with path.open('rb') as file:
         return [
             int(message.data[4:12]) for *_, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
@@ -188,7 +188,7 @@ def start(recorder: Recorder) -> str:
 
 
 def write_out(it: Desk) -> None:
-    """As the thread does it twice a second."""
+    """Write as the thread does, twice per second."""
     done = threading.Event()
 
     def sync() -> None:

@@ -1,4 +1,4 @@
-"""Bags of other recorders: files of the reference writer, and how the reference reader reads them."""
+"""Bags of other recorders: files of the reference writer, and their contents in the reference reader."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def ten(writer: Writer) -> None:
 
 
 def read(path: Path) -> list[tuple[object, ...]]:
-    """As the `mcap` package reads a file: everything of each message and of its channel but their numbers."""
+    """A file as the `mcap` package reads it: everything about each message and its channel except their ids."""
     with path.open('rb') as file:
         return [
             (channel.topic, channel.message_encoding, channel.metadata, schema and (schema.name, schema.encoding, schema.data),

@@ -1,4 +1,4 @@
-"""Slices as tests write them, and as the `mcap` package reads them: every checksum held, every index followed."""
+"""Slices as tests write them, and as the `mcap` package reads them: every checksum verified, every index followed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BLOB = Channel('/blob', 'nowhere/msg/Blob', '', '', '', '')
 
 
 class Recorded(NamedTuple):
-    """A message as it goes in and comes out."""
+    """A message as written and read."""
 
     topic: str
     log_ns: int
@@ -32,7 +32,7 @@ class Recorded(NamedTuple):
 
 
 def messages(count: int, *, size: int = 20) -> Iterator[tuple[Channel, Recorded]]:
-    """On three topics in turn, a millisecond apart; each one's bytes are its own."""
+    """On three topics, alternating, a millisecond apart; each with unique bytes."""
     for number in range(count):
         channel = (TALK, ECHO, BLOB)[number % 3]
         at = 1_800_000_000_000_000_000 + number * 1_000_000
@@ -51,7 +51,7 @@ def fill(writer: SliceWriter, written: Iterable[tuple[Channel, Recorded]], *, sy
 
 
 def closed(path: Path, count: int, *, compression: str = 'none', sync_every: int = 0) -> tuple[SliceInfo, list[Recorded]]:
-    """A whole slice."""
+    """A complete slice."""
     writer = SliceWriter(path, compression=compression, chunk_bytes=1 << 20)
     done = fill(writer, messages(count), sync_every=sync_every)
     return writer.close(), done
@@ -63,12 +63,12 @@ def indexed(path: Path) -> list[Recorded]:
 
 
 def in_order(path: Path) -> list[Recorded]:
-    """The messages as they follow one another in the file, read from its beginning without the summary."""
+    """The messages in file order, read from its beginning without the summary."""
     return _read(path, lambda file: NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False))
 
 
 def check(path: Path) -> None:
-    """Every message index entry points to its message, every summary offset to its group, and the summary's CRC-32 holds."""
+    """Every message index entry points to its message, every summary offset to its group, and the summary's CRC-32 is correct."""
     content = path.read_bytes()
     data = memoryview(b'')
     for record in StreamReader(io.BytesIO(content), emit_chunks=True, validate_crcs=True).records:

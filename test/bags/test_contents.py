@@ -40,7 +40,7 @@ from shadowhound_data_logger.stores.directory import DirectoryStore
     {'compression': CompressionType.LZ4, 'chunk_size': 60},
 ], ids=lambda options: ' '.join(options) or 'all')  # fmt: skip
 def test_every_part_of_a_summary_is_optional(tmp_path: Path, options: dict[str, Any]) -> None:
-    """What it does not have is counted, by channel."""
+    """Missing parts are replaced by counting, by channel."""
     folder = write(tmp_path / 'b' / 'b_0.mcap', ten, **options)
     found = info_folder(folder).description
     assert (found.messages, found.t_start_ns, found.t_end_ns) == (10, T0, T0 + 9 * S)
@@ -52,7 +52,7 @@ def test_every_part_of_a_summary_is_optional(tmp_path: Path, options: dict[str, 
 
 
 def test_a_complete_summary_is_enough(tmp_path: Path) -> None:
-    """Then nothing else of the file is read; without one ``read_summary`` finds nothing."""
+    """Then nothing else of the file is read; without one ``read_summary`` returns None."""
     folder = write(tmp_path / 'b' / 'b_0.mcap', ten)
     assert read_summary(LocalFile(folder / 'b_0.mcap')) == read_index(LocalFile(folder / 'b_0.mcap'))
     folder = write(tmp_path / 'c' / 'c_0.mcap', ten, **BARE)
@@ -96,7 +96,7 @@ def test_undecoded_messages_are_copied_verbatim(tmp_path: Path, name: str, is_ch
 
 
 def test_channels_are_counted_not_topics(tmp_path: Path) -> None:
-    """Two channels of one topic, of one type or of two, and with other QoS: also in a piece of the bag."""
+    """Two channels of one topic, of one type or of two, and with different QoS: also in a cut of the bag."""
 
     def fill(writer: Writer) -> None:
         qos = [{'offered_qos_profiles': f'- history: {n}\n  depth: 1', 'topic_type_hash': ''} for n in (1, 2)]
@@ -116,7 +116,7 @@ def test_channels_are_counted_not_topics(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('start', [T0, T0 + 20 * S], ids=['Humble', 'Galactic'])
 def test_the_files_count_not_the_totals_of_a_split_bag(tmp_path: Path, start: int) -> None:
-    """Humble records start and duration of the first file, Galactic of the last: info, cut and verify say so once."""
+    """Humble records start and duration of the first file, Galactic of the last: info, cut and verify report it once."""
     folder = tmp_path / 'b'
     for part in range(3):
 
@@ -174,12 +174,12 @@ def test_a_name_that_cannot_be_part_of_a_key_is_replaced(tmp_path: Path) -> None
 
 @pytest.mark.parametrize('name', ['a bag', '-x', 'ä', '..', '.hidden', 'x..y', '_', 'x' * 300])
 def test_every_folder_has_a_name_in_the_store(name: str) -> None:
-    """Also one with nothing but what cannot be part of a key."""
+    """Also one whose name has no valid character."""
     assert check_name(safe_bag(name), 'the bag', MAX_BAG_BYTES)
 
 
 def test_a_torn_file_of_a_split_bag_hides_no_other_file(tmp_path: Path) -> None:
-    """The others are shown, cut, verified and uploaded, and each verb reports the truncated one, which is stored unchanged."""
+    """The others are shown, cut, verified and uploaded, and each command reports the truncated one, which is stored unchanged."""
     for part in range(3):
         write(tmp_path / 'b' / f'b_{part}.mcap', ten)
     folder = tmp_path / 'b'
@@ -209,7 +209,7 @@ def test_a_torn_file_of_a_split_bag_hides_no_other_file(tmp_path: Path) -> None:
 
 
 def test_a_message_at_time_0_is_counted_although_the_statistics_lack_it(tmp_path: Path) -> None:
-    """As the Go library writes them, of a bag with simulated time: its chunks have it."""
+    """The Go library writes such files for a bag with simulated time: its chunks have it."""
 
     def fill(writer: Writer) -> None:
         channel = writer.register_channel('/clock', 'cdr', writer.register_schema(*STRING))
@@ -266,7 +266,7 @@ def test_a_list_downloads_no_bag(tmp_path: Path) -> None:
 
 
 def test_a_growing_bag_with_a_torn_file_is_fetched(tmp_path: Path) -> None:
-    """Its metadata.yaml is made of the files that can be read."""
+    """Its metadata.yaml is generated from the readable files."""
     store = DirectoryStore(tmp_path / 'store')
     for part in range(2):
         write(tmp_path / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b' / f'b_{part}.mcap', ten)
@@ -317,7 +317,7 @@ def storage(path: Path, version: int, messages: Sequence[tuple[int, int, bytes]]
 
 
 def metadata(folder: Path, files: Sequence[str], version: int, **changed: Any) -> None:
-    """What each version of the format has."""
+    """The fields of each version of the format."""
     told: dict[str, Any] = {
         'version': version, 'storage_identifier': 'sqlite3', 'relative_file_paths': list(files), 'message_count': len(MESSAGES),
         'duration': {'nanoseconds': 8 * 10**9}, 'starting_time': {'nanoseconds_since_epoch': T0},
@@ -341,7 +341,7 @@ def metadata(folder: Path, files: Sequence[str], version: int, **changed: Any) -
 
 
 def check(folder: Path, out: Path) -> None:
-    """Counts and times by the files, and a cut with every message."""
+    """Counts and times from the files, and a cut with every message."""
     found = info_folder(folder).description
     assert (found.messages, found.t_start_ns, found.t_end_ns) == (9, T0, T0 + 8 * 10**9)
     assert {topic.name: topic.messages for topic in found.topics} == {'/chat': 3, 'count': 3, '/mine': 3, '/silent': 0}
@@ -371,7 +371,7 @@ def test_every_version_of_rosbag2_is_read(tmp_path: Path, version: int, describe
 @pytest.mark.parametrize('mode', ['file', 'FILE', 'message'])
 @pytest.mark.parametrize('is_described', [True, False])
 def test_files_and_messages_compressed_by_rosbag2_are_read(tmp_path: Path, mode: str, is_described: bool) -> None:
-    """Files by their name, messages by how they begin: no CDR begins as zstd does."""
+    """Files by their name, messages by their first bytes: no CDR starts like zstd."""
     path = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE, packs=mode == 'message')
     if mode.lower() == 'file':
         packed = path.with_name('b_0.db3.zstd')
@@ -385,7 +385,7 @@ def test_files_and_messages_compressed_by_rosbag2_are_read(tmp_path: Path, mode:
 
 @pytest.mark.parametrize('name', ['b/b_0.db3', '/home/robot/bags/b/b_0.db3', './b_0.db3', 'part/b_0.db3'])
 def test_every_form_of_path_in_the_metadata_is_resolved(tmp_path: Path, name: str) -> None:
-    """With the folder of the bag in front (Foxy), absolute, or of a folder in it where that has the file."""
+    """With the bag's folder in front (Foxy), absolute, or in the bag's folder if that has the file."""
     folder = tmp_path / 'b'
     storage(folder / name if name.startswith('part') else folder / 'b_0.db3', FOXY)
     metadata(folder, [name], 3)
@@ -393,7 +393,7 @@ def test_every_form_of_path_in_the_metadata_is_resolved(tmp_path: Path, name: st
 
 
 def test_a_split_bag_has_the_totals_of_its_files(tmp_path: Path) -> None:
-    """Totals of the first or the last file alone are not believed: in a folder, in the list of a store, in the manifest."""
+    """Totals of the first or the last file alone are ignored: in a folder, in the list of a store, in the manifest."""
     folder = tmp_path / 'b'
     for part in range(3):
         storage(folder / f'b_{part}.db3', FOXY, MESSAGES[3 * part : 3 * part + 3])
@@ -420,7 +420,7 @@ def test_a_split_bag_has_the_totals_of_its_files(tmp_path: Path) -> None:
 
 
 def test_a_store_lists_sqlite_bags_without_reading_them(tmp_path: Path) -> None:
-    """Without a manifest, info shows what metadata.yaml claims, and says so."""
+    """Without a manifest, info shows the claims of metadata.yaml, and marks them as such."""
     folder = storage(tmp_path / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b' / 'b_0.db3', HUMBLE).parent
     metadata(folder, ['b_0.db3'], 5, message_count=7)
     found = info_of(DirectoryStore(tmp_path / 'store'), 'thor', 'b', tmp_path / 'home').description
@@ -458,7 +458,7 @@ def test_messages_without_a_topic_are_damage(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('suffix', ['-wal', '-journal'])
 def test_a_database_that_was_not_closed_is_read(tmp_path: Path, suffix: str) -> None:
-    """Has messages in another file: it is not read as if these were not there."""
+    """With messages in its write-ahead log: they are included."""
     path = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE)
     (path.parent / f'b_0.db3{suffix}').write_bytes(bytes(32))
     assert info_folder(path.parent).description.messages == 9
@@ -471,7 +471,7 @@ def test_a_database_that_was_not_closed_is_read(tmp_path: Path, suffix: str) -> 
 
 @pytest.mark.parametrize('named', ['b_0.db3', 'b_0.db3.zstd', ''])
 def test_a_file_that_is_also_there_packed_is_read_once(tmp_path: Path, named: str) -> None:
-    """Packed and not, after a crash of the recorder: its messages are not."""
+    """With and without compression, after a crash of the recorder: its messages count once."""
     path = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE)
     path.with_name('b_0.db3.zstd').write_bytes(zstandard.compress(path.read_bytes()))
     if named:
@@ -484,7 +484,7 @@ def test_a_file_that_is_also_there_packed_is_read_once(tmp_path: Path, named: st
     'topics_with_message_count', 'files',
 ])  # fmt: skip
 def test_a_missing_field_of_the_metadata_is_named(tmp_path: Path, field: str) -> None:
-    """Is read from the files; a number that would be wrong without it is reported."""
+    """It is read from the files; a number that would be wrong without it is reported."""
     folder = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE).parent
     metadata(folder, ['b_0.db3'], 5)
     told = json.loads((folder / 'metadata.yaml').read_text())
@@ -497,7 +497,7 @@ def test_a_missing_field_of_the_metadata_is_named(tmp_path: Path, field: str) ->
 
 
 def test_metadata_without_files_is_not_a_bag(tmp_path: Path) -> None:
-    """Is no bag that could be uploaded."""
+    """It cannot be uploaded."""
     (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
     with pytest.raises(BagError, match='is not a bag'):
         read_finished(tmp_path)

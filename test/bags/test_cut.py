@@ -1,4 +1,4 @@
-"""Cutting a piece out of a bag: exactly the messages in it, and of a store little more than their chunks."""
+"""Cutting a bag: exactly the messages of the range, reading little more than their chunks from a store."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_little_more_is_read_than_its_chunks(store: MemoryStore, tmp_path: Path)
 
 
 def test_a_cut_from_an_s3_server_is_the_same(seaweed: Tower, origin: Path, tmp_path: Path) -> None:
-    """Ranged reads over S3 give the same piece."""
+    """Ranged reads over S3 give the same cut."""
     s3 = open_store(seaweed.store_settings(), QUICK)
     try:
         stored(s3, origin)
@@ -117,7 +117,7 @@ def test_a_cut_from_an_s3_server_is_the_same(seaweed: Tower, origin: Path, tmp_p
 def test_a_cut_of_any_rosbag2_bag_is_an_mcap_bag(
     tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode, is_remote: bool
 ) -> None:
-    """Whatever rosbag2 writes becomes a plain MCAP bag of the same messages."""
+    """Any bag of rosbag2 becomes a plain MCAP bag with the same messages."""
     folder = tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'theirs'
     write_rosbags(folder, plugin, mode)
     choice = Choice('1', '2', topics=('/imu',))
@@ -135,7 +135,7 @@ def test_a_cut_of_any_rosbag2_bag_is_an_mcap_bag(
 
 
 def test_a_cut_has_qos_in_humbles_format(tmp_path: Path) -> None:
-    """Jazzy and Kilted record it in words, at which Humble's player ends."""
+    """Jazzy and Kilted record it as text, at which Humble's player exits."""
     folder = tmp_path / 'kilted'
     folder.mkdir()
     writer = SliceWriter(folder / 'kilted_0.mcap')
@@ -153,7 +153,7 @@ def test_a_cut_has_qos_in_humbles_format(tmp_path: Path) -> None:
     {'clock': 'set_later', 'boot_id': 'b', 'clock_offset_ns': '1760788778000000000'}, {'clock': 'unset', 'boot_id': 'b'},
 ])  # fmt: skip
 def test_the_clock_of_a_bag_is_that_of_its_piece(tmp_path: Path, clock: dict[str, str]) -> None:
-    """Of a piece of a piece as well; ``bag info`` shows it."""
+    """Also for a cut of a cut; ``bag info`` shows it."""
     infos = write_ours(tmp_path / 'early', slices=1, each=20, is_ended=False)
     (tmp_path / 'early' / 'metadata.yaml').write_bytes(metadata_yaml(infos, ros_distro='humble', custom_data=clock))
     cut_folder(tmp_path / 'early', tmp_path / 'piece', Choice('0.05'))
@@ -168,7 +168,7 @@ def test_the_clock_of_a_bag_is_that_of_its_piece(tmp_path: Path, clock: dict[str
 ])  # fmt: skip
 @pytest.mark.parametrize('without', ['metadata', 'm'], ids=['without metadata.yaml', 'without manifest.json as well'])
 def test_slices_in_a_store_give_the_clock_of_an_incomplete_bag(tmp_path: Path, clock: dict[str, str], without: str) -> None:
-    """Its metadata.yaml has not come yet: to who cuts it, asks for it, or fetches it."""
+    """Its metadata.yaml has not arrived yet: for cut, info and fetch."""
     store, folder = MemoryStore(), tmp_path / 'early'
     write_ours(folder, slices=2, each=20)
     for place, path in enumerate(sorted(folder.iterdir())):
@@ -190,7 +190,7 @@ def test_slices_in_a_store_give_the_clock_of_an_incomplete_bag(tmp_path: Path, c
     {'clock': 'set_later', 'boot_id': 'b' * 5000, 'clock_offset_ns': '1'}, {'clock': 'unset'}, {'clock': 'set'},
 ])  # fmt: skip
 def test_a_missing_clock_is_none(tmp_path: Path, custom: dict[str, str]) -> None:
-    """Of others' custom data nothing is believed."""
+    """Custom data of other recorders is ignored."""
     infos = write_ours(tmp_path / 'early', slices=1, each=2, is_ended=False)
     (tmp_path / 'early' / 'metadata.yaml').write_bytes(metadata_yaml(infos, ros_distro='humble', custom_data=custom))
     assert info_folder(tmp_path / 'early').description.clock == {}
@@ -209,14 +209,14 @@ def test_a_missing_clock_is_none(tmp_path: Path, custom: dict[str, str]) -> None
 def test_an_empty_cut_leaves_no_files(
     store: MemoryStore, tmp_path: Path, choice: Choice, error: type[Exception], text: str
 ) -> None:
-    """It says what there is instead."""
+    """The error has the available range."""
     with pytest.raises(error, match=text):
         cut_remote(store, find_bag(store, 'thor', NAME), tmp_path / 'piece', choice)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_piece_has_the_usual_file_permissions(origin: Path, tmp_path: Path) -> None:
-    """Its slice is not a private file of a spool: the umask alone decides."""
+    """Its slice is not a private file of a spool: only the umask decides."""
     before = os.umask(0o027)
     try:
         found = cut_folder(origin, tmp_path / 'piece', Choice('1', '2'))
@@ -228,7 +228,7 @@ def test_a_piece_has_the_usual_file_permissions(origin: Path, tmp_path: Path) ->
 
 
 def test_a_missing_bag_is_reported(origin: Path, tmp_path: Path) -> None:
-    """A topic that the bag does not have; a slice that has not arrived: of its time nothing is made up, nor called nothing."""
+    """A topic that the bag does not have; a slice that has not arrived: its time is neither invented nor called empty."""
     store = MemoryStore()
     stored(store, origin, without='_1.mcap')
     bag = find_bag(store, 'thor', NAME)
@@ -242,7 +242,7 @@ def test_a_missing_bag_is_reported(origin: Path, tmp_path: Path) -> None:
 
 
 def test_a_piece_does_not_become_a_part_of_its_bag(origin: Path) -> None:
-    """Its folder is refused there, and nothing is made."""
+    """A folder inside the bag is refused, and nothing is created."""
     before = sorted(origin.rglob('*'))
     for out in (origin / 'piece', origin / 'a' / 'b', origin / '..' / NAME / 'c'):
         with pytest.raises(BagError, match='inside the bag'):
@@ -258,7 +258,7 @@ def test_an_existing_folder_is_left_alone(store: MemoryStore, tmp_path: Path) ->
 
 
 def test_a_damaged_chunk_is_not_copied(origin: Path, tmp_path: Path) -> None:
-    """Its CRC-32 reveals it, and nothing remains of the cut."""
+    """Its CRC-32 reveals it, and the cut leaves nothing behind."""
     folder = tmp_path / NAME
     folder.mkdir()
     content = bytearray((origin / f'{NAME}_0.mcap').read_bytes())
@@ -304,7 +304,7 @@ def write_latched(folder: Path, *, repeats: bool) -> None:
 
 @pytest.mark.parametrize('repeats', [True, False], ids=['ours', 'another recorder'])
 def test_a_piece_begins_with_what_is_latched(tmp_path: Path, *, repeats: bool) -> None:
-    """All transforms, the last map, with their publish time, and each once, wherever the piece begins and how long it is."""
+    """All transforms, the last map, with their publish time, and each once, wherever the cut starts and however long it is."""
     bag = tmp_path / 'bag'
     write_latched(bag, repeats=repeats)
     for start, end, early, late in (
@@ -324,7 +324,7 @@ def test_a_piece_begins_with_what_is_latched(tmp_path: Path, *, repeats: bool) -
 
 
 def test_a_piece_of_other_topics_has_nothing_that_is_latched(tmp_path: Path) -> None:
-    """It has the topics that were chosen."""
+    """It has the selected topics."""
     write_latched(tmp_path / 'bag', repeats=True)
     found = cut_folder(tmp_path / 'bag', tmp_path / 'piece', Choice('1.5', topics=['/imu']))
     assert (found.latched, found.topics) == (0, 1)

@@ -125,14 +125,14 @@ FINE = {'storage': 'mcap', 'duration': '5', 'start': '7', 'name': '/a', 'qos': '
     ids=range(13),
 )  # fmt: skip
 def test_invalid_metadata_is_damage(changed: dict[str, str]) -> None:
-    """Aliases that stand for more than there is memory, depth, dates that no clock shows, lists for texts."""
+    """Aliases that expand beyond memory, depth, impossible dates, lists in place of strings."""
     assert describe_metadata(YAML.format(**FINE).encode(), 'x').messages == 1
     with pytest.raises(BagDamaged, match='metadata'):
         describe_metadata(YAML.format(**{**FINE, **changed}).encode(), 'x')
 
 
 def test_invalid_qos_is_ignored() -> None:
-    """Of a topic, and only of that."""
+    """Only of the topic that has it."""
     for qos in ("'[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[['", f"'{LAUGHS}'", '"' + 70_000 * 'a' + '"', '"- {a: 1"'):
         assert describe_metadata(YAML.format(**{**FINE, 'qos': qos}).encode(), 'x').topics[0].qos == ()
 
@@ -151,7 +151,7 @@ def test_an_invalid_manifest_is_damage(told: bytes) -> None:
     [('state', [[]] * 1000), ('bag', 10**400), ('missing', 7), ('event', {'name': 'x', 'triggers': [], 'pre_s': 10**400})],
 )
 def test_an_invalid_field_of_a_manifest_is_named(tmp_path: Path, name: str, value: object) -> None:
-    """And what stands there is not printed at any length."""
+    """And its value is truncated in the message."""
     write_ours(tmp_path / NAME, slices=1)
     told = json.loads((tmp_path / NAME / 'manifest.json').read_bytes())
     sys.set_int_max_str_digits(0)
@@ -165,7 +165,7 @@ def test_an_invalid_field_of_a_manifest_is_named(tmp_path: Path, name: str, valu
 
 
 def test_one_bad_bag_does_not_end_the_list(tmp_path: Path) -> None:
-    """``bag list`` and its times: others are told, the bad ones by name."""
+    """``bag list`` and its times: the others are shown, the bad ones by name."""
     store = DirectoryStore(tmp_path / 'store')
     root = tmp_path / 'store' / 'sensor-data' / 'thor' / 'rosbags'
     for name, body in (
@@ -183,7 +183,7 @@ def test_one_bad_bag_does_not_end_the_list(tmp_path: Path) -> None:
 
 
 def test_statistics_of_unknown_channels_are_ignored(tmp_path: Path) -> None:
-    """Statistics may count what no channel is: the rest is told."""
+    """Statistics may count unknown channels: the rest is shown."""
     write_ours(tmp_path / NAME, slices=1)
     path = tmp_path / NAME / f'{NAME}_0.mcap'
     body = bytearray(path.read_bytes())
@@ -214,7 +214,7 @@ PROGRAMS = {
 
 @pytest.mark.parametrize(('sql', 'says'), PROGRAMS.values(), ids=PROGRAMS)
 def test_a_sqlite_bag_runs_no_code(tmp_path: Path, sql: str, says: str) -> None:
-    """What is computed when it is read, and what is of another type than it should be."""
+    """Computed columns, and values of unexpected types."""
     write_rosbags(tmp_path / 'bag', StoragePlugin.SQLITE3, CompressionMode.NONE, count=20)
     database = sqlite3.connect(tmp_path / 'bag' / 'bag.db3')
     database.executescript(sql)
@@ -229,14 +229,14 @@ def test_a_sqlite_bag_runs_no_code(tmp_path: Path, sql: str, says: str) -> None:
 @pytest.mark.parametrize('plugin', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 @pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
 def test_externally_compressed_messages_are_cut_unchanged(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
-    """Both storages, both ways."""
+    """Both storages, both kinds of compression."""
     write_rosbags(tmp_path / 'bag', plugin, mode, count=20)
     found = cut_folder(tmp_path / 'bag', tmp_path / 'out', Choice(topics=['/text']))
     assert (found.messages, found.topics) == (10, 1)
 
 
 def test_a_file_that_unpacks_to_a_thousand_times_its_size_is_refused(tmp_path: Path) -> None:
-    """It ends at a thousand times its size, and leaves nothing."""
+    """Unpacking stops at a thousand times its size, and leaves no file."""
     write_rosbags(tmp_path / 'bag', StoragePlugin.SQLITE3, CompressionMode.FILE, count=20)
     path = next((tmp_path / 'bag').glob('*.zstd'))
     path.write_bytes(zeros('zstd'))
@@ -246,7 +246,7 @@ def test_a_file_that_unpacks_to_a_thousand_times_its_size_is_refused(tmp_path: P
 
 
 def test_crcs_still_count(tmp_path: Path) -> None:
-    """A chunk of the right size and other content."""
+    """A chunk with the correct size and different content."""
     chunk = record(Opcode.MESSAGE, bytes(30))
     path = tmp_path / 'a.mcap'
     right, wrong = (CHUNK.pack(T0, T0, len(chunk), crc) for crc in (0, zlib.crc32(b'other')))

@@ -21,7 +21,7 @@ from shadowhound_data_logger.core.status import EventStatus
 
 
 def test_an_event_has_the_seconds_before_and_after_its_trigger(tmp_path: Path) -> None:
-    """No more and no less; the manifest says why, whole and under the event's name."""
+    """No more and no less; the manifest has the reason, complete and under the event's name."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(20))
         done, text = it.events.trigger('fall', 'log_event', 'leg 2')
@@ -85,7 +85,7 @@ def test_triggers_that_overlap_are_one_event(tmp_path: Path) -> None:
 
 
 def test_an_event_is_no_longer_than_it_may_be(tmp_path: Path) -> None:
-    """What would make it longer is another event, which begins where it ended: nothing between them, nothing in both."""
+    """Otherwise it would be too long: a second event starts where the first ended, with no message lost or in both."""
     with buffer(tmp_path, max_s=3.0) as it:
         hear_each_second(it, range(10))
         it.events.trigger('fall', 'service')
@@ -142,7 +142,7 @@ def test_a_gap_within_an_event_is_missed(tmp_path: Path) -> None:
 
 
 def test_repeats_are_in_an_event_once(tmp_path: Path) -> None:
-    """What two subscriptions brought is one message."""
+    """A message delivered by two subscriptions is there once."""
     with buffer(tmp_path) as it:
         it.hear(range(5))
         it.hear(range(3, 8))
@@ -153,7 +153,7 @@ def test_repeats_are_in_an_event_once(tmp_path: Path) -> None:
 
 
 def test_latched_messages_are_in_each_event(tmp_path: Path) -> None:
-    """Though it came long before; each time it counts as received, and nothing of it is missed."""
+    """It arrived long before; each time it counts as received, and none of it is missed."""
     with buffer(tmp_path) as it:
         it.ring.put(MessageBatch('/tf_static', STRING, '', messages(range(40, 42)), 1), None, it.now_s[0])
         it.pass_s(60.0)
@@ -168,7 +168,7 @@ def test_latched_messages_are_in_each_event(tmp_path: Path) -> None:
 
 
 def test_an_event_is_uploaded_first_and_never_evicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its slices go before what the sensors keep, and stay when the disk is full."""
+    """Its slices are sent before the sensors' objects, and stay when the disk is full."""
     with buffer(tmp_path) as it:
         given: list[DataObject] = []
         put = it.writer.put
@@ -187,7 +187,7 @@ def test_an_event_is_uploaded_first_and_never_evicted(tmp_path: Path, monkeypatc
 
 
 def test_the_manifest_names_the_mission(tmp_path: Path) -> None:
-    """With the run's id, though that became known later."""
+    """With the run's id, though it became known later."""
     with buffer(tmp_path) as it:
         it.events.on_mission(mission())
         it.hear(range(5))
@@ -201,7 +201,7 @@ def test_the_manifest_names_the_mission(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('name', ['../../etc', 'über den Berg', '', 'x' * 300])
 def test_a_name_that_cannot_be_in_a_key_is_replaced(tmp_path: Path, name: str) -> None:
-    """An agent may call its event anything; the manifest has the name that it used."""
+    """An agent may use any name; the manifest has the original."""
     with buffer(tmp_path) as it:
         it.hear(range(2))
         it.events.trigger(name or '?', 'log_event')
@@ -214,7 +214,7 @@ def test_a_name_that_cannot_be_in_a_key_is_replaced(tmp_path: Path, name: str) -
 
 
 def test_an_empty_ring_makes_no_bag(tmp_path: Path) -> None:
-    """A trigger before the first message leaves nothing behind when nothing comes."""
+    """A trigger before the first message leaves no file if no message arrives."""
     with buffer(tmp_path) as it:
         it.events.trigger('early', 'service')
         it.pass_s(5.0)
@@ -224,7 +224,7 @@ def test_an_empty_ring_makes_no_bag(tmp_path: Path) -> None:
 
 
 def test_a_close_ends_the_event(tmp_path: Path) -> None:
-    """With what the ring has; nothing is triggered any more."""
+    """With the contents of the ring; later triggers have no effect."""
     with buffer(tmp_path) as it:
         it.hear(range(5))
         it.events.trigger('fall', 'service')
@@ -245,7 +245,7 @@ def test_without_topics_no_event_is_recorded(tmp_path: Path) -> None:
 
 
 def test_changed_settings_apply_immediately(tmp_path: Path) -> None:
-    """Those that are live: how far back, how long, and how many bytes."""
+    """Those that can be changed at run time: time before, time after, and bytes."""
     with buffer(tmp_path) as it:
         it.events.update(EventSettings(topics=('/talk',), pre_s=2.0, post_s=1.0, max_s=10.0, max_bytes=2 << 20))
         hear_each_second(it, range(10))
@@ -257,7 +257,7 @@ def test_changed_settings_apply_immediately(tmp_path: Path) -> None:
 
 
 class Disk:
-    """Takes nothing while it hangs."""
+    """Accepts no data while it hangs."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.works = threading.Event()
@@ -295,7 +295,7 @@ def test_messages_evicted_from_the_ring_before_they_were_written_are_dropped(
 
 
 def test_written_messages_leave_the_ring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is no second copy of the ring: what is on its way to the disk is one piece, and the rest still in the ring."""
+    """There is no second copy of the ring: one piece is being written, and the rest is still in the ring."""
     disk = Disk(monkeypatch)
     with buffer(tmp_path, max_bytes=16 << 20) as it:
         for number in range(15):
@@ -312,7 +312,7 @@ def test_written_messages_leave_the_ring(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_full_disk_loses_only_the_event(tmp_path: Path) -> None:
-    """What it takes nothing of is dropped and counted, and the next event is whole."""
+    """Messages that it does not accept are dropped and counted, and the next event is complete."""
     with buffer(tmp_path) as it:
         it.room[0] = False
         it.hear(range(5))
@@ -331,7 +331,7 @@ def test_a_full_disk_loses_only_the_event(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_cannot_be_created_costs_only_the_event(tmp_path: Path) -> None:
-    """It is tried again until the event is over, then its messages are dropped; nothing stays claimed."""
+    """It is retried until the event is over, then its messages are dropped; none stays claimed."""
     with buffer(tmp_path) as it:
         it.root.parent.mkdir(parents=True)
         it.root.write_text('in the way')
@@ -346,13 +346,13 @@ def test_a_folder_that_cannot_be_created_costs_only_the_event(tmp_path: Path) ->
 
 
 def killed(home: Path, it: Buffer) -> Path:
-    """What the next start would find had the node been killed now, with the accounts that were committed last."""
+    """The state that the next start would find after a kill now, with the last committed accounts."""
     it.rows()
     return kill(home)
 
 
 def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What reached the disk is in the event's bag, which says that the rest is missing; the ledger closes."""
+    """Data that reached the disk is in the event's bag, with a note that the rest is missing; the ledger balances."""
     monkeypatch.setattr('shadowhound_data_logger.bags.events.SYNC_S', 3600.0)  # the second trigger syncs
     home = tmp_path / 'home'
     with buffer(home) as it:
@@ -379,7 +379,7 @@ def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch
         assert [one['name'] for one in said['event']['triggers']] == ['fall', 'low_battery']
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['open'], row['dropped']) == (15, 10, 0, {'restart': 5})
-        assert said['missing'][-1]['messages'] is None  # how many is known of all its topics, not of the bag
+        assert said['missing'][-1]['messages'] is None  # the number is known for all its topics, not for the bag
         assert journaled(it.spool.root, 'events') == {('/talk', 'restart'): 5}
         assert not list(it.root.iterdir())
         it.hear(range(20, 25))

@@ -1,4 +1,4 @@
-"""Fetching a bag: whole, verified, resumed after a kill, and nothing twice."""
+"""Fetching a bag: complete, verified, resumed after a kill, and nothing downloaded twice."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from shadowhound_data_logger.stores.directory import DirectoryStore
 
 
 class Counting(MemoryStore):
-    """Breaks off after ``limit`` bytes of contents."""
+    """Fails after ``limit`` bytes of content."""
 
     limit = 1 << 62
     sent = 0
@@ -59,7 +59,7 @@ def files(folder: Path) -> dict[str, str]:
 
 
 def test_a_fetched_bag_is_the_uploaded_bag(store: Counting, tmp_path: Path) -> None:
-    """Every file is what the robot wrote, there are no others, and the reported progress adds up to all bytes."""
+    """Every file is identical to the robot's, there are no others, and the reported progress adds up to all bytes."""
 
     class Sum(ProgressListener):
         total = 0
@@ -92,7 +92,7 @@ def test_a_second_run_downloads_nothing(store: Counting, tmp_path: Path) -> None
 
 
 def test_an_interrupted_fetch_resumes(store: Counting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over the runs each byte comes once."""
+    """Over all runs each byte is downloaded once."""
     monkeypatch.setattr(retry, 'BASE_S', 0.0)
     bag = find_bag(store, 'thor', NAME)
     store.limit = bag.size // 2
@@ -106,7 +106,7 @@ def test_an_interrupted_fetch_resumes(store: Counting, tmp_path: Path, monkeypat
 
 
 def test_a_part_that_lost_its_content_is_downloaded_again(store: Counting, tmp_path: Path) -> None:
-    """After a power cut a part may be of the right length and hold zeros."""
+    """After a power cut a part may have the correct length and contain zeros."""
     part = tmp_path / 'here' / NAME / f'{NAME}_0.mcap.part'
     part.parent.mkdir(parents=True)
     part.write_bytes(bytes(5000))
@@ -115,7 +115,7 @@ def test_a_part_that_lost_its_content_is_downloaded_again(store: Counting, tmp_p
 
 
 def test_files_lost_in_the_store_are_reported(store: Counting, tmp_path: Path) -> None:
-    """A slice that is not what the manifest promises never gets its name."""
+    """A slice that differs from the manifest never gets its name."""
     other = tmp_path / 'other.bin'
     other.write_bytes(b'x' * 1000)
     key = f'thor/rosbags/{NAME}/{NAME}_1.mcap'
@@ -127,7 +127,7 @@ def test_files_lost_in_the_store_are_reported(store: Counting, tmp_path: Path) -
 
 
 def test_a_growing_bag_can_be_opened_and_completed(tmp_path: Path) -> None:
-    """Players get a metadata.yaml of what is there; when the bag has ended, its own replaces that."""
+    """Players get a metadata.yaml for the available files; when the bag has ended, its real one replaces that."""
     origin = tmp_path / 'robot' / NAME
     write_ours(origin)
     store = MemoryStore()
@@ -180,7 +180,7 @@ def test_two_concurrent_fetches_do_not_mix(store: Counting, tmp_path: Path) -> N
 
 
 def test_a_kill_costs_nothing(tmp_path: Path) -> None:
-    """Kill -9 in mid-fetch: the next run keeps what is there, and the bag is whole."""
+    """After kill -9 during a fetch the next run keeps the existing files, and the bag is complete."""
     origin = tmp_path / 'home' / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
     write_ours(origin, slices=2, each=3000)
     program = (

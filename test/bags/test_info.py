@@ -61,7 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def store(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> DirectoryStore:
-    """With that bag, uploaded."""
+    """A store with that bag, uploaded."""
     home = tmp_path_factory.mktemp('home')
     found = DirectoryStore(home / 'store')
     with plan_upload(folder, 'thor', BAG, home, is_archive=False) as sent:
@@ -94,7 +94,7 @@ def test_the_matrix_is_complete() -> None:
 
 
 def test_info_agrees_with_every_variant(folder: Path) -> None:
-    """Messages and times of each file, and the topics of the bag; nothing is at odds with its metadata."""
+    """Messages and times of each file, and the topics of the bag; without a contradiction to its metadata."""
     found = info_folder(folder).description
     parts = {part.name: (part.messages, part.t_start_ns, part.t_end_ns) for part in found.parts}
     assert parts == {f'{name}.mcap': facts(recorded) for name, recorded, _ in FOUND}
@@ -113,7 +113,7 @@ def test_a_cut_copies_every_variant_verbatim(folder: Path, tmp_path: Path) -> No
 
 
 def copied(recorded: Recorded, first_ns: int, last_ns: int) -> Iterator[tuple[object, ...]]:
-    """What a cut has of it."""
+    """The messages in a cut of it."""
     assert recorded.channel
     topic, encoding, metadata = recorded.channel
     for log_ns, publish_ns, sequence in recorded.messages:
@@ -139,7 +139,7 @@ def test_a_cut_of_a_file_without_messages_is_an_error(folder: Path, tmp_path: Pa
 
 @pytest.mark.parametrize('deep', [False, True])
 def test_every_variant_passes_verification(folder: Path, store: DirectoryStore, deep: bool) -> None:
-    """Each file is sound: in a folder, and in a store."""
+    """Each file is intact: in a folder, and in a store."""
     for found in (verify_folder(folder, deep=deep), verify_remote(store, find_bag(store, 'thor', BAG), deep=deep)):
         assert [(check.name, check.finding) for check in found.findings] == []
         assert {check.name for check in found.checks} == {f'{name}.mcap' for name, _, _ in FOUND}
@@ -147,7 +147,7 @@ def test_every_variant_passes_verification(folder: Path, store: DirectoryStore, 
 
 
 def test_every_variant_is_uploaded_and_listed(store: DirectoryStore, tmp_path: Path) -> None:
-    """The manifest has of each file what is in it, and so have the commands that read the bag in the store."""
+    """The manifest has the contents of each file, and so do the commands that read the bag in the store."""
     bag = find_bag(store, 'thor', BAG)
     manifest = read_manifest(store, bag)
     assert manifest is not None
@@ -300,7 +300,7 @@ def test_verification_finds_a_summary_that_contradicts_the_data(tmp_path: Path) 
 
 
 def test_attachments_are_not_read(tmp_path: Path) -> None:
-    """However large they are, and whatever verb skips them: 3 GB of a sparse file, with messages before and behind."""
+    """Of any size, by any command: 3 GB of a sparse file, with messages before and after."""
     folder, size = tmp_path / 'b', 3 << 30
     folder.mkdir()
     with (folder / 'b_0.mcap').open('wb') as file:
@@ -346,7 +346,7 @@ NAMES = {'/a': {'a': '/a', '/a': '/a', 'a/': '/a'}, 'b': {'b': 'b', '/b': 'b'}, 
 
 
 def test_topics_are_found_with_and_without_a_leading_slash(tmp_path: Path) -> None:
-    """Are found however they are written; if a bag has both, the one that is named."""
+    """With or without it; if a bag has both, the one with the exact name."""
 
     def fill(writer: Writer) -> None:
         schema = writer.register_schema(*STRING)
@@ -366,7 +366,7 @@ def test_topics_are_found_with_and_without_a_leading_slash(tmp_path: Path) -> No
 
 @pytest.mark.parametrize('name', ['my bag', '-x', 'späti', "it's", 'x.mcap'])
 def test_a_folder_may_have_any_name(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Are read by a path with a slash; one file by its name alone."""
+    """Folders are read by a path with a slash; one file by its name alone."""
     write(tmp_path / name / f'{name}_0.mcap', lambda writer: writer.add_message(
         writer.register_channel('/x', 'cdr', writer.register_schema(*STRING)), 1, CDR, 1))  # fmt: skip
     monkeypatch.chdir(tmp_path)
@@ -381,7 +381,7 @@ def test_a_folder_may_have_any_name(tmp_path: Path, name: str, monkeypatch: pyte
 
 @pytest.mark.parametrize('is_chunked', [True, False])
 def test_every_checksum_of_a_file_is_checked(tmp_path: Path, is_chunked: bool) -> None:
-    """By ``verify --deep``: a bit that flipped anywhere but in the length of a record or the magic is found."""
+    """By ``verify --deep``: a flipped bit anywhere except in the length of a record or the magic is found."""
 
     def fill(writer: Writer) -> None:
         channel = writer.register_channel('/x', 'cdr', writer.register_schema(*STRING))
@@ -397,7 +397,7 @@ def test_every_checksum_of_a_file_is_checked(tmp_path: Path, is_chunked: bool) -
 
 
 def test_schemas_that_share_a_name_are_distinguished(tmp_path: Path) -> None:
-    """They are kept apart, on one topic or on two."""
+    """On one topic or on two."""
 
     def fill(writer: Writer) -> None:
         schemas = [writer.register_schema(STRING[0], STRING[1], text) for text in (b'string data', b'string other', b'')]

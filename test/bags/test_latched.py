@@ -1,4 +1,4 @@
-"""Each slice of a bag begins with the latched messages that a new subscriber would receive; they count once, as received."""
+"""Each slice of a bag starts with the latched messages that a new subscriber would receive; they count once, as received."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Told(NamedTuple):
 
 
 def told(path: Path) -> list[Told]:
-    """In the order of the file."""
+    """In file order."""
     with path.open('rb') as file:
         return [
             Told(channel.topic, int(message.data[4:12]), channel.metadata.get('shadowhound_repeated') == 'true', message.log_time,
@@ -51,7 +51,7 @@ def slices(it: Desk, bag: str) -> list[Path]:
 
 
 def test_each_slice_begins_with_what_is_latched(tmp_path: Path) -> None:
-    """With the last message of each publisher, before all others by log time, with its own publish time and number."""
+    """With the last message of each publisher, before all others by log time, with its publish time and number."""
     with desk(tmp_path) as it:
         bag = start(it.recorder)
         it.hear(range(1, 3), STATIC, latched=2)
@@ -92,7 +92,7 @@ def test_a_slice_is_played_on_its_own(tmp_path: Path) -> None:
 
 
 def test_repeats_are_not_received(tmp_path: Path) -> None:
-    """The ledger counts what was received; metadata and manifest count what the files hold, and what of it is repeated."""
+    """The ledger counts received messages; metadata and manifest count those in the files, and which of them are repeated."""
     with desk(tmp_path) as it:
         bag = start(it.recorder)
         it.hear(range(1, 3), STATIC, latched=1)
@@ -155,7 +155,7 @@ def test_a_slice_of_only_repeats_is_not_written(tmp_path: Path) -> None:
 
 
 def test_a_bag_does_not_depend_on_the_previous_one(tmp_path: Path) -> None:
-    """Its publishers are asked again (``Consumer.begin``): what it begins with is received, and counted."""
+    """Its publishers are queried again (``Consumer.begin``): the first messages are received, and counted."""
     with desk(tmp_path, record='always') as it:
         it.hear(range(1, 2), STATIC, latched=1)
         it.recorder.on_mission(mission())
@@ -181,7 +181,7 @@ def test_messages_latched_during_a_pause_are_in_later_slices(tmp_path: Path) -> 
 
 
 def test_messages_latched_while_the_disk_is_full_are_in_later_slices(tmp_path: Path) -> None:
-    """It was dropped, and is counted so; the slice after it begins with it."""
+    """It was dropped, and counted as such; the next slice starts with it."""
     with desk(tmp_path) as it:
         bag = start(it.recorder)
         it.hear(range(1, 2), STATIC, latched=1)
@@ -199,7 +199,7 @@ def test_messages_latched_while_the_disk_is_full_are_in_later_slices(tmp_path: P
 
 
 def test_a_large_map_does_not_end_slices_early(tmp_path: Path) -> None:
-    """Slices are measured without what they repeat; what is larger than a slice may be is not repeated."""
+    """Slices are measured without repeats; a message above the slice size is not repeated."""
     with desk(tmp_path, slice_bytes=1 << 20) as it:
         bag = start(it.recorder)
         it.hear(range(1, 2), '/map', size=900_000, latched=1)
@@ -222,7 +222,7 @@ def of(publisher: str | None, number: int, topic: str = STATIC, size: int = 0, p
 
 
 def test_one_latched_message_is_kept_per_publisher() -> None:
-    """The newest, in the order of arrival; without publishers' names as many as there are; the same content counts once."""
+    """The newest, in order of arrival; without publisher ids as many as there are publishers; equal content counts once."""
     latched = Latched(1 << 20)
     for one in (of('p', 1), of('q', 2), of('p', 3), of('r', 3)):
         latched.keep(one)
@@ -234,7 +234,7 @@ def test_one_latched_message_is_kept_per_publisher() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    """A topic whose publishers come and go drops its own oldest messages; one that is too large drops none."""
+    """A topic with changing publishers drops its oldest messages; one that is too large drops none of the others."""
     latched = Latched(1 << 20)
     latched.keep(of('p', 1))
     for number in range(2, 20):

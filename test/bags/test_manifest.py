@@ -39,7 +39,7 @@ def test_a_manifest_is_read_as_it_was_written(manifest: Manifest) -> None:
 
 
 def test_the_fields_that_other_programs_read_are_unchanged() -> None:
-    """Names and places are a contract with every reader of the store."""
+    """Names and positions are a contract with every reader of the store."""
     found = json.loads(WHOLE.to_json())
     assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices', 'event',
                            'clock']  # fmt: skip
@@ -60,7 +60,7 @@ def test_the_cause_of_an_event_round_trips() -> None:
     )  # fmt: skip
     assert Manifest.from_json(replace(WHOLE, event=event).to_json()).event == event
     found = json.loads(replace(WHOLE, event=event).to_json())
-    del found['event']['triggers'][0]['who']  # as versions wrote it that knew nobody
+    del found['event']['triggers'][0]['who']  # as versions without a requester wrote it
     before = Manifest.from_json(json.dumps(found).encode()).event
     assert before is not None
     assert before.triggers[0] == TriggerOf('fall', 'page', 7, None)
@@ -95,7 +95,7 @@ def test_a_manifest_is_made_from_its_slices(tmp_path: Path) -> None:
     ('missing[0].messages', -3),
 ])  # fmt: skip
 def test_an_invalid_field_is_named(place: str, value: object) -> None:
-    """One field that is not as it must be refuses the whole, and the error says which."""
+    """One invalid field rejects the complete manifest, and the error names it."""
     found = json.loads(WHOLE.to_json())
     inner: Any = found
     *way, last = place.replace('[0]', '.0').split('.')
@@ -109,7 +109,7 @@ def test_an_invalid_field_is_named(place: str, value: object) -> None:
 
 
 def test_a_newer_manifest_may_have_more_fields() -> None:
-    """Fields that are not known are ignored."""
+    """Unknown fields are ignored."""
     found = {**json.loads(WHOLE.to_json()), 'color': 'blue'}
     assert Manifest.from_json(json.dumps(found).encode()) == WHOLE
 

@@ -1,4 +1,4 @@
-"""What a bag is called."""
+"""Names of bags."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BOOT = '3e2c1f6a-8a4e-4d0e-9d0a-0f6a5b7c9d11'
 
 
 def test_names_are_sorted_by_their_numbers() -> None:
-    """They say what and when, in UTC, and differ; a slice's number is found again."""
+    """With the content and the time in UTC, and unique; the number of a slice can be parsed."""
     assert bag_name('', NOON_NS, lambda _: False) == 'recording_20251018_120000'
     assert bag_name('../../etc', NOON_NS, lambda _: False) == 'etc_20251018_120000'
     taken = {'patrol_20251018_120000', 'patrol_20251018_120000_1'}
@@ -24,7 +24,7 @@ def test_names_are_sorted_by_their_numbers() -> None:
 
 @pytest.mark.parametrize('what', ['a/b', '..', 'a..b', 'über den Berg', '\u202e\ud800', 'x' * 300, 'x.' * 40, '-', '\0\n', ' '])
 def test_every_mission_gives_a_valid_bag_name(what: str) -> None:
-    """Whatever an agent calls its mission: one part of a key, a file name with its slices', and one that the verbs take."""
+    """For any mission name: one part of a key, a file name with its slices', and a valid argument of the commands."""
     for name in (bag_name(what, NOON_NS, lambda _: False), unsynced_name(f'event_{what}', BOOT, 12 * 10**9, lambda _: False)):
         assert check_name(name, 'the bag', MAX_BAG_BYTES) == name
         assert check_key(key_of('thor', name, slice_file(name, 100_000))).count('/') == 3

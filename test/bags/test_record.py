@@ -38,7 +38,7 @@ while True:
 
 @pytest.fixture
 def home(domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """While a program publishes odometry and text at 50 Hz."""
+    """A home, while a program publishes odometry and text at 50 Hz."""
     environ = {'ROS_DOMAIN_ID': str(domain),
                'SHADOWHOUND_HOME': str(tmp_path / 'home'), 'AWS_ENDPOINT_URL': ''}  # fmt: skip
     for name, value in environ.items():
@@ -55,7 +55,7 @@ def rosbags_of(home: Path) -> Path:
 
 @pytest.mark.long('starts more processes')
 def test_the_function_of_the_guide_records_and_uploads(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """It returns when the store has the bag, with every topic that was published: the robot is not a Unitree."""
+    """It returns when the store has the bag, with every published topic: the robot is not a Unitree."""
     found = record_and_upload_rosbag('patrol', 2)
     assert (found.delivered, found.dropped) == (True, 0)
     assert f'Uploaded: s3://sensor-data/thor/rosbags/{found.bag}/' in capfd.readouterr().out
@@ -70,7 +70,7 @@ def test_the_function_of_the_guide_records_and_uploads(home: Path, capfd: pytest
 
 @long
 def test_only_the_named_topics_are_recorded(home: Path) -> None:
-    """A named topic alone; where nothing comes an error says so, and no bag is left."""
+    """Only that topic; if no message arrives there is an error, and no bag is left."""
     found = record('words', 1.0, topics=['/text'])
     assert list(found.topics) == ['/text']
     with pytest.raises(BagError, match='nothing was published'):
@@ -80,7 +80,7 @@ def test_only_the_named_topics_are_recorded(home: Path) -> None:
 
 @long
 def test_a_later_recorder_completes_and_uploads_the_bag_of_a_killed_one(home: Path) -> None:
-    """Kill -9 while it records: the next recording makes it whole and says what may be missing."""
+    """After kill -9 during a recording: the next one completes the bag and records what may be missing."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
     child = subprocess.Popen([sys.executable, '-m', program, '--robot=thor', '--duration=60', '--topic=/odom', 'cut_off'])
     end = time.monotonic() + 60

@@ -1,4 +1,4 @@
-"""Bags begin and end as they are asked to, and whatever was received is in one of them, or the ledger says why not."""
+"""Bags start and end on request, and every received message is in one of them, or the ledger has the reason."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_bag_is_recorded_from_start_to_stop(tmp_path: Path) -> None:
 
 
 def test_both_stamps_and_the_number_are_kept(tmp_path: Path) -> None:
-    """Log time is when it came, publish time when it was sent, sequence the publisher's number."""
+    """Log time is the arrival, publish time the time of sending, sequence the publisher's number."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
         it.hear(range(7, 8))
@@ -57,7 +57,7 @@ def test_both_stamps_and_the_number_are_kept(tmp_path: Path) -> None:
 
 
 def test_messages_without_a_number_get_their_position_in_the_bag(tmp_path: Path) -> None:
-    """From 1 for each topic, whatever of them came at once and in whatever slice they are: no sequence repeats."""
+    """From 1 for each topic, in any drain and in any slice: no sequence number repeats."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
         for numbers in (range(1, 6), range(6, 8)):
@@ -75,7 +75,7 @@ def test_messages_without_a_number_get_their_position_in_the_bag(tmp_path: Path)
 
 
 def test_requests_in_the_wrong_order_are_refused(tmp_path: Path) -> None:
-    """One bag at a time; without one there is nothing to stop, split or pause."""
+    """One bag at a time; without one, stop, split and pause are refused."""
     with desk(tmp_path) as it:
         for ask in (it.recorder.stop, it.recorder.split, lambda: it.recorder.pause(paused=True)):
             assert ask() == (False, 'nothing is recorded')
@@ -84,7 +84,7 @@ def test_requests_in_the_wrong_order_are_refused(tmp_path: Path) -> None:
 
 
 def test_bags_that_start_in_the_same_second_have_different_names(tmp_path: Path) -> None:
-    """Also when the first one has left this disk; and one without messages leaves nothing."""
+    """Also when the first one has left this disk; and one without messages leaves no file."""
     with desk(tmp_path) as it:
         names = []
         for number in range(3):
@@ -99,7 +99,7 @@ def test_bags_that_start_in_the_same_second_have_different_names(tmp_path: Path)
 
 
 def test_slices_end_by_size(tmp_path: Path) -> None:
-    """None is much larger than it may be, and all are in the bag in their order."""
+    """None is much larger than the limit, and all are in the bag in order."""
     with desk(tmp_path, slice_bytes=1 << 20) as it:
         name = start(it.recorder)
         for first in range(0, 50, 10):
@@ -113,7 +113,7 @@ def test_slices_end_by_size(tmp_path: Path) -> None:
 
 
 def test_a_full_queue_is_a_loss_with_a_reason(tmp_path: Path) -> None:
-    """What the queue has no room for is dropped, the newest first, and counted; the rest is recorded."""
+    """Messages that do not fit into the queue are dropped, the newest first, and counted; the rest is recorded."""
     with desk(tmp_path, queue_bytes=1 << 20) as it:
         name = start(it.recorder)
         it.hear(range(20), size=100_000)
@@ -123,7 +123,7 @@ def test_a_full_queue_is_a_loss_with_a_reason(tmp_path: Path) -> None:
 
 
 def test_a_bag_follows_its_mission(tmp_path: Path) -> None:
-    """The bag starts and ends with the mission, is named after its type, and has its ids, even if that of the run came later."""
+    """The bag starts and ends with the mission, is named after its type, and has its ids, even if the run's arrived later."""
     with desk(tmp_path, record='mission') as it:
         it.recorder.on_mission(None)
         assert not it.recorder.status().recording
@@ -179,7 +179,7 @@ def test_messages_received_between_two_bags_are_in_one_of_them(tmp_path: Path, m
 
 
 def test_a_bag_that_cannot_end_does_not_prevent_the_next_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever its end raises costs no message of the one that follows."""
+    """An exception at its end loses no message of the next one."""
     with desk(tmp_path, record='always') as it:
         it.hear(range(10))
         with monkeypatch.context() as patch:
@@ -195,7 +195,7 @@ def test_a_bag_that_cannot_end_does_not_prevent_the_next_one(tmp_path: Path, mon
 
 
 def test_a_bag_started_by_the_operator_continues_after_missions(tmp_path: Path) -> None:
-    """A bag that a service began ends when a service says so."""
+    """A bag started by a service ends by a service."""
     with desk(tmp_path, record='mission') as it:
         name = start(it.recorder)
         it.recorder.on_mission(mission())
@@ -204,7 +204,7 @@ def test_a_bag_started_by_the_operator_continues_after_missions(tmp_path: Path) 
 
 
 def test_a_stop_of_the_node_ends_the_bag(tmp_path: Path) -> None:
-    """All that was handed over is in the spool then, as a complete bag."""
+    """Everything passed on is then in the spool, as a complete bag."""
     with desk(tmp_path, record='always') as it:
         name = it.recorder.status().bag
         it.hear(range(100))
@@ -214,21 +214,21 @@ def test_a_stop_of_the_node_ends_the_bag(tmp_path: Path) -> None:
 
 
 def kill(home: Path, number: int = 0) -> Path:
-    """What the next start would find had the node been killed now."""
+    """The state that the next start would find after a kill now."""
     copy = home.with_name(f'{home.name}-after-{number}')
     shutil.copytree(home, copy, copy_function=_copy)
     return copy
 
 
 def _copy(source: str, target: str) -> None:
-    """Slices that were delivered in between are no longer in the spool."""
+    """Delivered slices are no longer in the spool."""
     with suppress(FileNotFoundError):
         shutil.copy2(source, target)
 
 
 @pytest.mark.parametrize('synced', [True, False])
 def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synced: bool) -> None:
-    """Closed slices and what was synced of the open one are spooled; the rest is lost by the restart, as the manifest says."""
+    """Closed slices and the synced part of the open one are spooled; the rest is lost by restart, as in the manifest."""
     home = tmp_path / 'home'
     monkeypatch.setattr('shadowhound_data_logger.bags.recorder.SYNC_S', 3600.0)
     with desk(home, record='always') as it:
@@ -260,7 +260,7 @@ def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch
 
 
 def test_an_interrupted_startup_is_repeated(tmp_path: Path) -> None:
-    """Whatever of a bag was spooled before a second death, nothing is in the spool twice and the ledger closes."""
+    """Whatever was spooled before a second kill, nothing is in the spool twice and the ledger balances."""
     home = tmp_path / 'home'
     with desk(home, record='always') as it:
         name = it.recorder.status().bag
@@ -270,7 +270,7 @@ def test_an_interrupted_startup_is_repeated(tmp_path: Path) -> None:
         left = kill(home)
     with desk(left) as it:
         it.recorder._recovery.worker.join(60)
-        shutil.copytree(home / 'bags', tmp_path / 'again')  # the folder as it was, beside a spool that has the bag
+        shutil.copytree(home / 'bags', tmp_path / 'again')  # the folder as before, next to a spool that has the bag
         again = kill(left)
     shutil.rmtree(again / 'bags', ignore_errors=True)
     folder = again / 'bags' / ROBOT / name
@@ -283,7 +283,7 @@ def test_an_interrupted_startup_is_repeated(tmp_path: Path) -> None:
 
 
 def deliver(it: Desk) -> None:
-    """All that waits, as the uploader has it."""
+    """Deliver everything pending, as the uploader does."""
     assert it.writer.flush(60)
     it.writer.settle([Outcome(item, State.DELIVERED) for item in it.spool.pending(1000)])
     assert it.writer.flush(60)
@@ -296,7 +296,7 @@ def lose_index(home: Path) -> None:
 
 @pytest.mark.parametrize('delivered', [0, 1, 2])
 def test_the_state_of_a_bag_survives_the_loss_of_the_index(tmp_path: Path, delivered: int) -> None:
-    """Its manifest is the same, whether the slices of before are still on this robot, some of them, or none."""
+    """Its manifest is the same, whether all, some or none of the earlier slices are still on this robot."""
     home, ends = tmp_path / 'home', []
     with desk(home, record='mission', queue_bytes=1000) as it:
         it.recorder.on_mission(mission())

@@ -44,7 +44,7 @@ def test_a_full_disk_loses_only_messages_of_that_time(tmp_path: Path) -> None:
 
 @pytest.mark.long('a second of CPU or more')
 def test_manifest_and_gap_parts_agree(tmp_path: Path) -> None:
-    """What was dropped for want of room: as many messages by topic and reason in both."""
+    """Messages dropped because of a full disk: the same counts by topic and reason in both."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
         it.hear(range(5))
@@ -70,7 +70,7 @@ def test_manifest_and_gap_parts_agree(tmp_path: Path) -> None:
 
 
 def _retry(it: Desk) -> None:
-    """As if the time until the next try were over, after all that waits."""
+    """As if the time until the next try had passed, after everything pending."""
     done = threading.Event()
 
     def again() -> None:
@@ -174,7 +174,7 @@ def test_the_manifest_lists_the_slices_that_a_full_spool_evicted(tmp_path: Path)
 
 
 def test_slices_evicted_after_the_end_are_reported_on_the_robot(tmp_path: Path) -> None:
-    """Their manifest was made already: the list says why they never come."""
+    """Their manifest was already written: the list has the reason for their absence."""
     with desk(tmp_path, slice_bytes=1 << 20, spool={'max_bytes': 4 << 20}) as it:
         start(it.recorder)
         it.hear(range(20), size=100_000)

@@ -33,7 +33,7 @@ BAG = 'patrol_20251018_120000'
 
 
 def foreign(path: Path, bag: str, robot: str, owner: str) -> None:
-    """A slice at ``path`` whose record is of another recording."""
+    """A slice at ``path`` with the record of another recording."""
     other = BagState(Path('/nowhere') / bag, bag, robot)
     other.add_slice(replace(closed(path.with_name('tmp.mcap'), 4)[0], path=other.folder / slice_file(bag, 0)))
     path.with_name('tmp.mcap').unlink()
@@ -102,7 +102,7 @@ def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
 
 
 def test_a_row_without_a_folder_is_removed(tmp_path: Path) -> None:
-    """What was delivered is listed, the rest is not known, and the row goes."""
+    """Delivered slices are listed, others are unknown, and the row is removed."""
     home = tmp_path / 'home'
     with desk(home, record='always') as it:
         name = it.recorder.status().bag
@@ -121,7 +121,7 @@ def test_a_row_without_a_folder_is_removed(tmp_path: Path) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Of a bag that was cut off: a slice that is whole, and one that is open, each with ten messages."""
+    """The folder of an interrupted bag: a complete slice, and an open one, each with ten messages."""
     made = tmp_path / 'home' / 'bags' / ROBOT / BAG
     made.mkdir(parents=True)
     closed(made / f'{BAG}_0.mcap', 10)
@@ -133,7 +133,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def recovered(home: Path) -> dict[str, Path]:
-    """What is in the spool after a start."""
+    """The contents of the spool after a start."""
     with desk(home) as it:
         it.recorder._recovery.worker.join(60)
         assert it.recorder._recovery.worker.failures == 0
@@ -166,7 +166,7 @@ def test_links_are_not_followed(folder: Path, tmp_path: Path) -> None:
 
 
 def test_files_that_are_not_slices_are_set_aside(folder: Path, tmp_path: Path) -> None:
-    """A folder, a slice of another bag, a name without a number; twice of one name as well."""
+    """A folder, a slice of another bag, a name without a number; also two with the same name."""
     home = tmp_path / 'home'
     (folder / f'{BAG}_5.mcap').mkdir()
     (folder / 'other_20251018_120000_0.mcap').write_bytes(b'')
@@ -182,7 +182,7 @@ def test_files_that_are_not_slices_are_set_aside(folder: Path, tmp_path: Path) -
 
 
 def test_a_broken_bag_does_not_block_others(folder: Path, tmp_path: Path) -> None:
-    """It is tried again; the bags after it are completed during that time, and the node records."""
+    """It is retried; later bags are completed during that time, and the node records."""
     later = folder.with_name('patrol_20251018_130000')
     later.mkdir()
     closed(later / f'{later.name}_0.mcap', 7)
@@ -205,7 +205,7 @@ UNSET = 'recording_unsynced_this-boot_00000060'
 
 
 def hear(it: Desk, clock: Clocks, numbers: range) -> None:
-    """Messages that came just now, as this machine's clock has it."""
+    """Messages received just now, by this machine's clock."""
     came_ns = clock.wall_ns()
     heard = [Taken(b'\0\1\0\0%08d' % number, came_ns, 'p', number, came_ns + number * 1000) for number in numbers]
     with it.spool.accounts.entry(f'{BAG_SINK}/talk') as account:
@@ -220,7 +220,7 @@ def log_times(path: Path) -> list[int]:
 
 
 def bags_of(found: dict[str, Path]) -> dict[str, list[int]]:
-    """Bag -> the numbers of its messages, in the order of its slices."""
+    """Bag -> the numbers of its messages, in slice order."""
     names = sorted({key.partition('/')[0] for key in found})
     slices = {bag: [key for key in found if key.startswith(f'{bag}/') and key.endswith('.mcap')] for bag in names}
     order = {bag: sorted(keys, key=lambda key: slice_number(bag, key.partition('/')[2]) or 0) for bag, keys in slices.items()}
@@ -233,7 +233,7 @@ def is_whole(it: Desk) -> None:
 
 
 def test_a_bag_never_spans_the_moment_in_which_the_clock_is_set(tmp_path: Path) -> None:
-    """It ends then and leaves under the date at which it began; another follows without a message between them."""
+    """It ends then and is delivered with its start date; the next one follows without losing a message."""
     clock = Clocks()
     with desk(tmp_path, clock, record='always') as it:
         assert it.recorder.status().bag == UNSET
@@ -282,7 +282,7 @@ def test_messages_received_before_the_clock_was_set_have_correct_times_in_a_late
 
 
 def test_a_bag_that_ends_before_the_clock_is_set_waits_for_it(tmp_path: Path) -> None:
-    """In its folder, as the stop says; it is whole in the spool under its date as soon as that is known."""
+    """It stays in its folder, as the stop reports; it is complete in the spool with its date as soon as that is known."""
     clock = Clocks()
     with desk(tmp_path, clock) as it:
         it.recorder.on_mission(mission())
@@ -307,7 +307,7 @@ def test_a_bag_that_ends_before_the_clock_is_set_waits_for_it(tmp_path: Path) ->
 
 
 def test_a_bag_gets_a_name_without_a_date_when_the_clock_is_not_set_in_time(tmp_path: Path) -> None:
-    """What began before leaves under the name of its boot, as objects do, and says that its date is not known."""
+    """Bags from before are named after their boot, like objects, with a note that the date is unknown."""
     clock = Clocks()
     with desk(tmp_path, clock, record='always') as it:
         hear(it, clock, range(3))
@@ -332,7 +332,7 @@ def test_a_bag_gets_a_name_without_a_date_when_the_clock_is_not_set_in_time(tmp_
 
 
 def left_in_1970(home: Path, boot_id: str = 'this-boot') -> Path:
-    """A home whose node died while it recorded, before the clock was set."""
+    """A home with a node that was killed during a recording, before the clock was set."""
     clock = Clocks(boot_id=boot_id)
     with desk(home, clock, record='always') as it:
         hear(it, clock, range(5))
@@ -343,7 +343,7 @@ def left_in_1970(home: Path, boot_id: str = 'this-boot') -> Path:
 
 @pytest.mark.parametrize('index', ['there', 'lost'])
 def test_after_a_restart_in_the_same_boot_a_bag_still_waits_for_the_clock(tmp_path: Path, index: str) -> None:
-    """What a dead node left is dated once the clock is set, and says that it was cut off."""
+    """A killed node's bag is dated once the clock is set, with a note that it was interrupted."""
     left = left_in_1970(tmp_path / 'home')
     if index == 'lost':
         lose_index(left)
@@ -363,7 +363,7 @@ def test_after_a_restart_in_the_same_boot_a_bag_still_waits_for_the_clock(tmp_pa
 
 @pytest.mark.parametrize('offset_ns', [None, NOON_NS - 60 * SECOND])
 def test_after_a_reboot_a_bag_is_named_by_what_its_boot_recorded(tmp_path: Path, offset_ns: int | None) -> None:
-    """It ships at once: under the date if that boot's clock was set after all, else under the name of that boot."""
+    """It is shipped immediately: with the date if that boot's clock was set after all, otherwise named after that boot."""
     left = left_in_1970(tmp_path / 'home')
     clock = Clocks(boot_id='next-boot')
     with desk(left, clock, offsets={'this-boot': offset_ns} if offset_ns else {}, record='always') as it:
@@ -374,7 +374,7 @@ def test_after_a_reboot_a_bag_is_named_by_what_its_boot_recorded(tmp_path: Path,
 
 
 def test_a_chosen_name_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever becomes of the clock after a death between two slices: a bag has one name."""
+    """Whatever the clock does after a kill between two slices: a bag keeps its name."""
     left = left_in_1970(tmp_path / 'home')
     for hour in range(2):
         clock = Clocks()
@@ -390,7 +390,7 @@ def test_a_chosen_name_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_waiting_bag_survives_the_loss_of_the_index(tmp_path: Path) -> None:
-    """It is complete, under its date, with the mission that it was recorded in."""
+    """It is complete, with its date, and with the mission in which it was recorded."""
     clock = Clocks()
     with desk(tmp_path / 'home', clock) as it:
         it.recorder.on_mission(mission(run_id='r'))
@@ -410,7 +410,7 @@ def test_a_waiting_bag_survives_the_loss_of_the_index(tmp_path: Path) -> None:
 
 
 def test_an_event_before_the_clock_is_set_waits_for_it(tmp_path: Path) -> None:
-    """As any bag; the seconds before the trigger, and its time, are by the clock of the event."""
+    """Like any bag; the seconds before the trigger, and its time, follow the clock of the event."""
     clock = Clocks()
     with buffer(tmp_path, clock) as it:
         came_ns = clock.wall_ns()
@@ -438,7 +438,7 @@ def test_an_event_before_the_clock_is_set_waits_for_it(tmp_path: Path) -> None:
 
 
 def test_two_events_wait_at_the_same_time(tmp_path: Path) -> None:
-    """Both leave, each under its own date."""
+    """Both are delivered, each with its date."""
     clock = Clocks()
     with buffer(tmp_path, clock) as it:
         for number, name in enumerate(('one', 'two'), 1):

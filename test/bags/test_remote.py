@@ -1,4 +1,4 @@
-"""Bags as the store, the spool and the recording folder show them, and times as people write them."""
+"""Bags in the store, the spool and the recording folder, and times in user input."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ def row(store: MemoryStore | DirectoryStore, home: Path, name: str = NAME) -> Ba
 
 
 def test_a_complete_bag_is_described_by_its_manifest(tmp_path: Path) -> None:
-    """Its manifest describes it completely."""
     store = MemoryStore()
     write_ours(tmp_path / NAME)
     stored(store, tmp_path / NAME)
@@ -35,7 +34,7 @@ def test_a_complete_bag_is_described_by_its_manifest(tmp_path: Path) -> None:
 
 
 def test_a_growing_bag_is_described_by_its_slices(tmp_path: Path) -> None:
-    """In the store one, in the recording folder a closed one and the open one; nothing is opened for it."""
+    """One slice in the store, a closed one and the open one in the recording folder; no file is opened for it."""
     store, recording = MemoryStore(), tmp_path / 'home' / 'bags' / 'thor' / NAME
     write_ours(recording, slices=2, is_ended=False)
     path = recording / f'{NAME}_0.mcap'
@@ -48,7 +47,7 @@ def test_a_growing_bag_is_described_by_its_slices(tmp_path: Path) -> None:
 
 
 def test_a_manifest_before_its_slices_is_no_complete_bag(tmp_path: Path) -> None:
-    """It is small and overtakes them: the bag grows until all that it promises is there."""
+    """It is small and arrives first: the bag grows until everything in it has arrived."""
     store = MemoryStore()
     write_ours(tmp_path / NAME)
     stored(store, tmp_path / NAME, without='_1.mcap')
@@ -72,7 +71,7 @@ def test_bags_of_other_recorders_are_foreign(tmp_path: Path) -> None:
 
 
 def test_only_bags_since_a_time_are_listed(tmp_path: Path) -> None:
-    """By the time at which they began; an older one is not opened for it."""
+    """By start time; an older one is not opened."""
     store = MemoryStore()
     for name in (NAME, 'patrol_20240101_000000'):
         write_ours(tmp_path / name, slices=1, each=10)
@@ -83,7 +82,7 @@ def test_only_bags_since_a_time_are_listed(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_suggests_similar_ones(tmp_path: Path) -> None:
-    """A slip of the hand is the commonest error."""
+    """Typos are the most common error."""
     store = MemoryStore()
     write_ours(tmp_path / NAME, slices=1, each=10)
     stored(store, tmp_path / NAME)
@@ -92,7 +91,7 @@ def test_an_unknown_name_suggests_similar_ones(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_described_like_a_store(tmp_path: Path) -> None:
-    """The same as of the store; without metadata.yaml from the slices themselves."""
+    """The same as for the store; without metadata.yaml from the slices themselves."""
     write_ours(tmp_path / NAME)
     found = info_folder(tmp_path / NAME)
     (tmp_path / NAME / 'metadata.yaml').unlink()
@@ -113,6 +112,6 @@ def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
 
 
 def test_the_time_of_a_bag_is_in_its_name() -> None:
-    """Of our recordings alone, packed or not."""
+    """Only for our recordings, compressed or not."""
     assert time_in_name('patrol_20251018_120000') == time_in_name('patrol_20251018_120000.tar.gz') == T0
     assert time_in_name('rosbag2_2025_10_18-12_00_00') is None

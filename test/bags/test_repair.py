@@ -1,4 +1,4 @@
-"""``bag repair``: whole bags and single files, of this package and of others, copied or in place."""
+"""``bag repair``: complete bags and single files, of this package and of others, copied or in place."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def count(path: Path) -> int:
-    """By another reader, all messages."""
+    """The number of messages according to another reader."""
     with Reader(path) as reader:
         return sum(1 for _ in reader.messages())
 
@@ -80,7 +80,7 @@ def test_torn_slices_are_repaired_and_the_losses_are_in_the_manifest(ours: Path,
 
 
 def test_a_bag_is_repaired_in_place(ours: Path) -> None:
-    """The same, where the bag is; a second repair finds nothing."""
+    """The same at the bag's location; a second repair finds nothing."""
     tear(ours / f'{NAME}_1.mcap', 5000)
     found = repair_bag(ours, in_place=True)
     assert found.out == ours
@@ -159,7 +159,7 @@ os._exit(0)
 
 @pytest.mark.parametrize('in_place', [False, True])
 def test_a_database_that_was_not_closed_is_completed(tmp_path: Path, *, in_place: bool) -> None:
-    """What its recorder had committed to the write-ahead log is in the result, and the log is not."""
+    """Data that its recorder had committed to the write-ahead log is in the result, and the log is gone."""
     bag = tmp_path / 'bag'
     write_rosbags(bag, StoragePlugin.SQLITE3, CompressionMode.NONE)
     subprocess.run([sys.executable, '-c', WAL, str(bag / 'bag.db3')], check=True)
@@ -218,7 +218,7 @@ def test_an_unreadable_file_of_a_bag_does_not_stop_the_repair(ours: Path) -> Non
 
 
 def test_the_intact_files_of_a_torn_bag_can_be_cut(ours: Path, tmp_path: Path) -> None:
-    """`cut` copies them, `verify` names the torn one, and both say how it is repaired."""
+    """`cut` copies them, `verify` names the torn one, and both explain how to repair it."""
     tear(ours / f'{NAME}_1.mcap', 5000)
     found = cut_folder(ours, tmp_path / 'piece', Choice())
     assert list(found.damaged) == [f'{NAME}_1.mcap']
@@ -241,7 +241,7 @@ repair_bag(Path(sys.argv[1]), in_place=True)
     'after_s', [0.0, 0.02, 0.1, *(pytest.param(0.01 * more, marks=pytest.mark.long('kills')) for more in range(20, 60, 2))]
 )
 def test_a_kill_during_a_repair_in_place_loses_nothing(tmp_path: Path, after_s: float) -> None:
-    """Each file is the old one or the new one, and the next repair completes what is left."""
+    """Each file is the old or the new one, and the next repair completes the rest."""
     bag = tmp_path / NAME
     write_ours(bag)
     for number in range(3):

@@ -1,4 +1,4 @@
-"""The ring keeps the last seconds within its bytes, and knows what an event asked for of what has to go."""
+"""The ring keeps the last seconds within its bytes, and counts the messages claimed by an event that it had to discard."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KEEP_S = 10.0
 
 
 def kept(ring: Ring) -> list[int]:
-    """The numbers of the messages in it, oldest first; it is empty then."""
+    """The numbers of the messages in it, oldest first; it is empty afterwards."""
     ring.claim(float('-inf'))
     return [number for held in iter(lambda: ring.next(float('inf')), None) for number in told(held)]
 
@@ -35,7 +35,7 @@ def test_messages_that_are_too_old_are_discarded() -> None:
 
 
 def test_the_oldest_messages_are_discarded_when_the_ring_is_full() -> None:
-    """Whatever the time: the bytes count, with what Python needs for each message."""
+    """At any age: the bytes count, including Python's overhead for each message."""
     ring = Ring(10 * (12 + MESSAGE_BYTES), KEEP_S)
     for number in range(25):
         assert ring.put(batch(range(number, number + 1)), None, 0.0) == []
@@ -44,7 +44,7 @@ def test_the_oldest_messages_are_discarded_when_the_ring_is_full() -> None:
 
 
 def test_a_large_claim_is_written_in_pieces() -> None:
-    """One drain of a fast camera does not push out a whole second; what was lost with it belongs to its end."""
+    """One drain of a fast camera does not displace a full second; messages lost with it belong to its end."""
     ring = Ring(8 * PIECE_BYTES, KEEP_S)
     ring.put(batch(range(10), size=PIECE_BYTES // 2), {'transport': 3}, 0.0)
     ring.claim(0.0)
@@ -54,7 +54,7 @@ def test_a_large_claim_is_written_in_pieces() -> None:
 
 
 def test_a_message_that_is_larger_than_the_ring_is_not_kept() -> None:
-    """Nor does it leave anything else there."""
+    """Nor is any other message displaced."""
     ring = Ring(1 << 20, KEEP_S)
     ring.put(batch(range(3)), None, 0.0)
     ring.put(batch(range(3, 4), size=2 << 20), None, 0.0)
@@ -62,7 +62,7 @@ def test_a_message_that_is_larger_than_the_ring_is_not_kept() -> None:
 
 
 def test_messages_are_not_copied() -> None:
-    """What comes out is what went in, the very same bytes."""
+    """The same bytes objects are returned."""
     ring, taken = Ring(1 << 20, KEEP_S), messages(range(5), 100)
     ring.put(MessageBatch('/talk', 'std_msgs/msg/String', '', taken), None, 0.0)
     ring.claim(0.0)
@@ -131,13 +131,13 @@ def latched(*numbers: int, publisher: str | None = 'p', size: int = 0, publisher
 
 
 def of_event(ring: Ring) -> list[tuple[str, str | None, list[int], bool]]:
-    """What an event gets: topic, publisher, numbers, and whether it is there once more."""
+    """The contents of an event: topic, publisher, numbers, and whether a message is repeated."""
     found = list(iter(lambda: ring.next(float('inf')), None))
     return [(held.batch.topic, held.batch.messages[0].publisher, told(held), held.repeated) for held in found]
 
 
 def test_latched_messages_are_at_the_start_of_each_event() -> None:
-    """The last message of each publisher, however long ago it left the ring, with the time of the oldest that is there."""
+    """The last message of each publisher, however long ago it left the ring, with the time of the oldest one in it."""
     ring = Ring(1 << 20, KEEP_S)
     ring.put(latched(1, 2), None, 0.0)
     ring.put(latched(5, publisher='q'), None, 0.0)
@@ -160,7 +160,7 @@ def test_latched_messages_are_at_the_start_of_each_event() -> None:
 
 
 def test_without_publisher_ids_one_message_is_latched_per_publisher() -> None:
-    """Where the middleware does not say who sent what (Humble), the last ones stay, as many as there are publishers."""
+    """If the middleware does not report the sender (Humble), the last ones are kept, as many as there are publishers."""
     ring = Ring(1 << 20, KEEP_S)
     ring.put(latched(1, 2, 3, publisher=None), None, 0.0)
     ring.put(latched(3, publisher=None), None, 0.0)
@@ -169,7 +169,7 @@ def test_without_publisher_ids_one_message_is_latched_per_publisher() -> None:
 
 
 def test_an_event_starts_with_latched_messages() -> None:
-    """Now; and one that is over leaves nothing for the next."""
+    """For the current event; a finished one leaves none for the next."""
     ring = Ring(1 << 20, KEEP_S)
     ring.put(latched(1), None, 0.0)
     for now_ns in (77, 78):
@@ -181,7 +181,7 @@ def test_an_event_starts_with_latched_messages() -> None:
 
 
 def test_latched_messages_count_against_the_byte_limit() -> None:
-    """At most half of the ring is for it; when that is full, the oldest messages of the same topic are dropped."""
+    """They use at most half of the ring; when that is full, the oldest messages of the same topic are dropped."""
     ring = Ring(1 << 20, KEEP_S)
     for number in range(12):
         ring.put(latched(number, publisher=str(number), size=100_000), None, 0.0)

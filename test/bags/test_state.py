@@ -32,7 +32,7 @@ def info(folder: Path, number: int, size: int = 10, channels: tuple[Channel, ...
 
 @pytest.fixture
 def state(tmp_path: Path) -> BagState:
-    """With all that there can be."""
+    """A state with all fields."""
     made = BagState.begin(tmp_path / 'thor' / 'b', 'thor', MissionOf('patrol', 'patrol_1', None), EVENT, CLOCK)
     made.add_slice(info(made.folder, 0))
     made.add_slice(info(made.folder, 1, channels=(POSE, IMU)))
@@ -51,7 +51,7 @@ def test_state_round_trips(state: BagState) -> None:
 
 
 def test_each_record_has_only_changes(state: BagState) -> None:
-    """Each loss has its own number, so a loss that is stored twice exists once."""
+    """Each loss has a number, so a loss that is stored twice counts once."""
     rows = state.add_missing(Missing('b_1.mcap', 'more', 1))
     assert ([one.place for one in rows.missing], rows.slices) == ([2], ())
     rows = state.add_slice(info(state.folder, 2))
@@ -60,7 +60,7 @@ def test_each_record_has_only_changes(state: BagState) -> None:
 
 @pytest.mark.parametrize('size', [1 << 20, pytest.param(64 << 20, marks=pytest.mark.long('64 MB'))])
 def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> None:
-    """However many slices a bag has: the newest are in it, and so is what was lost last."""
+    """For any number of slices: the record has the newest ones, and the latest losses."""
     topics = tuple(replace(IMU, topic=f'/robot/topic_{number}', qos='q' * 400) for number in range(20))
     state = BagState(tmp_path / 'patrol_20251018_120000', 'patrol_20251018_120000', 'thor')
     for number in range(2000):
@@ -77,7 +77,7 @@ def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> Non
 
 
 def test_the_last_record_of_a_slice_counts(tmp_path: Path) -> None:
-    """A trigger or a mission's run that became known while it was written."""
+    """For a trigger or a run id that became known while it was written."""
     state = BagState.begin(tmp_path / 'b', 'thor', MissionOf('patrol', 'patrol_1', None))
     writer = SliceWriter(tmp_path / 'b' / 'b_0.mcap')
     writer.add_metadata(RECORD, state.record('thor', 0))
@@ -96,6 +96,6 @@ def test_the_last_record_of_a_slice_counts(tmp_path: Path) -> None:
     {'missing': '[[0, 7, "what", null, null, null]]'}, {'missing': '[' * 100_000}, {'slices': 'x'},
 ])  # fmt: skip
 def test_an_implausible_state_is_refused(state: BagState, change: dict[str, str]) -> None:
-    """Whatever a flipped bit or another program made of it."""
+    """From a flipped bit or another program."""
     with pytest.raises(BagDamaged):
         BagState.of_record(state.folder, 'thor', {**state.record('thor', 2), **change})

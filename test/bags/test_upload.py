@@ -77,7 +77,7 @@ def test_finished_bags_are_uploaded_unchanged(
 
 
 def test_uploading_twice_uploads_once(settings: Settings, tmp_path: Path) -> None:
-    """The second time nothing is spooled, and the answer is the same."""
+    """The second time nothing is spooled, and the result is the same."""
     write_ours(tmp_path / NAME)
     assert send(settings, tmp_path / NAME) == send(settings, tmp_path / NAME)
     with closing(open_store(settings.store, settings.upload)) as store:
@@ -104,7 +104,7 @@ def test_another_bag_of_that_name_is_refused(settings: Settings, store: Director
 
 
 def test_an_archive_has_the_layout_of_the_guide(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
-    """thor/rosbags/<name>.tar.gz with the bag's folder in it; made twice it is the same bytes."""
+    """thor/rosbags/<name>.tar.gz with the bag's folder in it; creating it twice gives the same bytes."""
     write_ours(tmp_path / NAME)
     assert send(settings, tmp_path / NAME, is_archive=True).is_delivered
     body = store.get(BUCKET, f'thor/rosbags/{NAME}.tar.gz')
@@ -116,7 +116,7 @@ def test_an_archive_has_the_layout_of_the_guide(settings: Settings, store: Direc
 
 @pytest.mark.long('an outage of some seconds')
 def test_an_unreachable_tower_is_not_a_failure(tmp_path: Path, seaweed: Tower) -> None:
-    """The bag waits in the spool, whatever becomes of its folder, and the next process delivers it."""
+    """The bag waits in the spool, whatever happens to its folder, and the next process delivers it."""
     settings = Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0},
                              {'SHADOWHOUND_HOME': str(tmp_path / 'home'), 'AWS_ENDPOINT_URL': 'http://127.0.0.1:9'})  # fmt: skip
     write_ours(tmp_path / NAME)
@@ -133,7 +133,7 @@ def test_an_unreachable_tower_is_not_a_failure(tmp_path: Path, seaweed: Tower) -
 
 
 def test_a_full_spool_is_reported(tmp_path: Path) -> None:
-    """The remedy is to go past it."""
+    """The remedy is to bypass it."""
     settings = Settings.load(
         {'spool.max_bytes': 1 << 20, 'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path / 'home')}
     )
@@ -163,7 +163,7 @@ def test_an_unfinished_bag_is_refused(settings: Settings, tmp_path: Path, what: 
 
 
 def test_a_bag_that_changes_after_it_was_spooled_is_reported(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
-    """What small files were is sent; a slice that is not what it was is refused, and never sent under its name."""
+    """Small files are sent as they were; a changed slice is refused, and never sent under its name."""
     write_ours(tmp_path / NAME, slices=2, each=1500)
     before = contents(tmp_path / NAME)
     with (
@@ -185,7 +185,7 @@ def test_a_bag_that_changes_after_it_was_spooled_is_reported(settings: Settings,
 
 @pytest.mark.parametrize('is_archive', [False, True])
 def test_a_link_out_of_the_bag_is_refused(settings: Settings, tmp_path: Path, is_archive: bool) -> None:
-    """Neither is what it names sent, nor an archive in which it names something else."""
+    """Neither its target is sent, nor an archive with a changed target."""
     write_ours(tmp_path / NAME, slices=1)
     (tmp_path / 'secret').write_text('secret')
     (tmp_path / NAME / 'notes.txt').symlink_to(tmp_path / 'secret')
@@ -202,7 +202,7 @@ def test_a_name_that_is_no_key_is_refused(settings: Settings, tmp_path: Path) ->
 
 
 class Hand:
-    """A clock that is turned by hand."""
+    """A clock that the test moves."""
 
     def __init__(self) -> None:
         self.now = 0.0

@@ -1,4 +1,4 @@
-"""What is a finished bag, whatever its metadata.yaml claims."""
+"""Finished bags are recognized, whatever their metadata.yaml contains."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOMB = b'a: &a [x, x]\n' + b''.join(
     b'rosbag2_bagfile_information: !!python/object/apply:os.system ["true"]\n', b'#' + b'x' * (5 << 20),
 ], ids=['empty', 'zeros', 'no text', 'a list', 'deep', 'deeper', 'a bomb', 'itself', 'a program', 'huge'])  # fmt: skip
 def test_invalid_metadata_is_rejected(tmp_path: Path, content: bytes) -> None:
-    """In a moment, and as what it is."""
+    """Immediately, with the correct error."""
     write_ours(tmp_path / NAME, slices=1, each=5)
     (tmp_path / NAME / 'metadata.yaml').write_bytes(content)
     with pytest.raises(BagDamaged, match='is not metadata of a rosbag2 bag'):
@@ -34,7 +34,7 @@ def test_invalid_metadata_is_rejected(tmp_path: Path, content: bytes) -> None:
     ('nanoseconds_since_epoch', '[]'), ('relative_file_paths', '7'), ('topics_with_message_count', '7'),
 ])  # fmt: skip
 def test_a_metadata_with_a_wrong_value_is_refused(tmp_path: Path, what: str, value: str) -> None:
-    """Wherever it stands."""
+    """In any field."""
     write_ours(tmp_path / NAME, slices=1, each=5)
     path = tmp_path / NAME / 'metadata.yaml'
     path.write_text(re.sub(rf'( +)({what}:).*', rf'\1\2 {value}\n\1other_{what}:', path.read_text(), count=1))

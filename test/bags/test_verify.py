@@ -1,4 +1,4 @@
-"""Verifying a bag: what is whole is sound, and every kind of damage is found, in a store and in a folder."""
+"""Verifying a bag: intact bags pass, and every kind of damage is found, in a store and in a folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FIRST = f'{NAME}_0.mcap'
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A bag in a folder that is a store's as well, of a writer who left no checksums there."""
+    """A bag in a folder that is also a store's, from a writer without checksums."""
     found = tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
     write_ours(found)
     return found
@@ -74,27 +74,27 @@ def lose(folder: Path) -> None:
 
 @pytest.mark.parametrize('damage', [flip, cut_off, exchange, lose])
 def test_damage_is_reported(folder: Path, damage: Callable[[Path], None]) -> None:
-    """The slice is named, by --deep from the store, and in a folder always."""
+    """With the name of the slice, by --deep from the store, and always in a folder."""
     damage(folder)
     for found in (verify_folder(folder), verify_folder(folder, deep=True), remotely(folder, deep=True)):
         assert [check.name for check in found.findings] == [FIRST]
 
 
 def test_a_bag_without_a_manifest_is_compared_with_its_metadata(folder: Path) -> None:
-    """A flipped bit shows by the CRC of its chunk, with --deep."""
+    """With --deep a flipped bit is found by the CRC of its chunk."""
     (folder / 'manifest.json').unlink()
     assert verify_folder(folder).state == 'foreign'
     flip(folder)
     assert verify_folder(folder).is_intact
     assert [check.name for check in verify_folder(folder, deep=True).findings] == [FIRST]
     exchange(folder)
-    assert verify_folder(folder, deep=True).is_intact  # as many messages, all of them whole: nobody says what they were
+    assert verify_folder(folder, deep=True).is_intact  # the same number of intact messages: their original contents are unknown
     lose(folder)
     assert [check.finding for check in verify_folder(folder).findings] == ['is missing']
 
 
 def test_a_growing_bag_is_reported(folder: Path) -> None:
-    """Its slices are sound, and it is not complete."""
+    """Its slices are intact, and it is not complete."""
     store = MemoryStore()
     for name in (FIRST, f'{NAME}_1.mcap'):
         stored(store, only(folder, name))
@@ -103,7 +103,7 @@ def test_a_growing_bag_is_reported(folder: Path) -> None:
 
 
 def only(folder: Path, name: str) -> Path:
-    """A folder of the same name with one of the files."""
+    """A folder with the same name and one of the files."""
     part = folder.parents[4] / name / NAME
     part.mkdir(parents=True)
     shutil.copy(folder / name, part / name)
@@ -128,7 +128,7 @@ def test_bags_of_other_recorders_are_verified(tmp_path: Path, plugin: StoragePlu
 
 
 def test_a_broken_manifest_is_a_finding(folder: Path) -> None:
-    """The slices are held against the metadata then."""
+    """The slices are then compared with the metadata."""
     (folder / 'manifest.json').write_text('{}')
     found = verify_folder(folder)
     assert [check.name for check in found.findings] == ['manifest.json']
@@ -136,7 +136,7 @@ def test_a_broken_manifest_is_a_finding(folder: Path) -> None:
 
 
 def test_a_folder_that_is_not_a_bag_is_reported(tmp_path: Path) -> None:
-    """An empty folder, or one of other things."""
+    """An empty folder, or one with other files."""
     with pytest.raises(BagError, match='is not a bag'):
         verify_folder(tmp_path)
     (tmp_path / 'notes.txt').write_text('x')
@@ -145,7 +145,7 @@ def test_a_folder_that_is_not_a_bag_is_reported(tmp_path: Path) -> None:
 
 
 def test_a_slice_that_was_thinned_is_no_damage(folder: Path) -> None:
-    """The manifest says what was recorded; the object says itself that the robot ran out of room, and is whole as it says."""
+    """The manifest has what was recorded; the object records that the robot ran out of room, and matches its description."""
     (folder / FIRST).unlink()
     (folder / f'{NAME}_1.mcap').rename(folder / FIRST)
     store = MemoryStore()

@@ -9,7 +9,7 @@ NOW_NS = 1_760_788_800 * SECOND
 
 
 def test_times_are_utc() -> None:
-    """Stamps become UTC, to the microsecond, whatever the zone of the machine."""
+    """Stamps become UTC, to the microsecond, in any time zone of the machine."""
     assert iso(NOW_NS + 250_000_999) == '2025-10-18T12:00:00.250000Z'
 
 
@@ -22,7 +22,7 @@ def test_no_stamp_is_rounded_up(stamp_ns: int) -> None:
 
 
 def test_the_machine_has_a_boot() -> None:
-    """The identity of this boot is the same twice, and its clocks go forward."""
+    """The boot id is constant, and the clocks advance."""
     one, two = SystemClock.of_this_machine(), SystemClock.of_this_machine()
     assert one.boot_id == two.boot_id != ''
     assert one.boot_ns() <= two.boot_ns()

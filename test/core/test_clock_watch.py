@@ -1,4 +1,4 @@
-"""Whether the clock is set, and when it steps, is found with the boot clock and logged once; offsets date what came before."""
+"""Unset clocks and clock steps are found with the boot clock and logged once; offsets date earlier objects."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from shadowhound_data_logger.core.clock_watch import ClockWatch, UtcOffsets
 
 @pytest.fixture
 def clocks() -> Clocks:
-    """They are not set."""
+    """Clocks that are not set."""
     return Clocks()
 
 
 def test_a_clock_before_2024_is_not_set(clocks: Clocks) -> None:
-    """Its offset is not known, and how long it is so is."""
+    """Its offset is unknown, and the time since it started is known."""
     watch = ClockWatch(clocks, 600.0)
     clocks.wait(5)
     state = watch.state()
@@ -29,7 +29,7 @@ def test_a_clock_before_2024_is_not_set(clocks: Clocks) -> None:
 
 
 def test_setting_the_clock_is_a_step(clocks: Clocks) -> None:
-    """It is told without waiting for the next look, and counted by that; only once."""
+    """It is reported immediately instead of at the next poll, and counted only once."""
     watch = ClockWatch(clocks, 600.0)
     clocks.set()
     assert (watch.is_set, watch.state().unset_s, watch.state().steps) == (True, 0.0, 0)
@@ -39,7 +39,7 @@ def test_setting_the_clock_is_a_step(clocks: Clocks) -> None:
 
 @pytest.mark.parametrize(('step_s', 'steps'), [(3600.0, 1), (-3600.0, 1), (1.5, 1), (-1.5, 1), (0.9, 0), (-0.9, 0)])
 def test_a_step_is_more_than_a_second(clocks: Clocks, step_s: float, steps: int) -> None:
-    """In either direction; and it says by how much and when that was."""
+    """In either direction; with its size and time."""
     clocks.set()
     watch = ClockWatch(clocks, 600.0)
     clocks.offset_ns += round(step_s * SECOND)
@@ -50,7 +50,7 @@ def test_a_step_is_more_than_a_second(clocks: Clocks, step_s: float, steps: int)
 
 
 def test_a_clock_that_is_slewed_does_not_step(clocks: Clocks) -> None:
-    """Half a millisecond a second, for hours: each look compares with the last one."""
+    """0.5 ms per second, for hours: each poll compares with the previous one."""
     clocks.set()
     watch = ClockWatch(clocks, 600.0)
     for _ in range(4 * 3600):
@@ -60,7 +60,7 @@ def test_a_clock_that_is_slewed_does_not_step(clocks: Clocks) -> None:
 
 
 def test_the_clock_is_not_waited_for_indefinitely(clocks: Clocks) -> None:
-    """After the time that was set, and only while it is not set; a later setting counts as any."""
+    """After the configured time, and only while it is not set; setting it later counts as usual."""
     watch = ClockWatch(clocks, 600.0)
     clocks.wait(600)
     assert not watch.state().gave_up
@@ -71,7 +71,7 @@ def test_the_clock_is_not_waited_for_indefinitely(clocks: Clocks) -> None:
 
 
 def test_a_lost_clock_is_waited_for_again(clocks: Clocks) -> None:
-    """Back in 1970, the wait begins there."""
+    """Back in 1970, the wait starts again."""
     clocks.set()
     watch = ClockWatch(clocks, 600.0)
     clocks.wait(5000)
@@ -105,7 +105,7 @@ def test_each_change_is_logged_once(clocks: Clocks, caplog: pytest.LogCaptureFix
 
 
 def test_a_clock_watch_is_a_clock(clocks: Clocks) -> None:
-    """Whoever asks for the time gets that of the machine."""
+    """Its time is that of the machine."""
     clocks.set()
     watch = ClockWatch(clocks, 600.0)
     assert (watch.wall_ns(), watch.boot_ns(), watch.boot_id) == (NOON_NS, 60 * SECOND, 'this-boot')
@@ -117,12 +117,12 @@ KNOWN_NS = 1234 * SECOND
 
 @pytest.fixture
 def offsets(clocks: Clocks) -> UtcOffsets:
-    """It knows one earlier boot, and has an old note of this one."""
+    """It has one earlier boot, and an old record of this one."""
     return UtcOffsets(clocks, HOLD_S, lambda: {'known-boot': KNOWN_NS, 'this-boot': 1})
 
 
 def test_dating_waits_while_the_clock_is_not_set(clocks: Clocks, offsets: UtcOffsets) -> None:
-    """For as long as it may, counted from the beginning; then it goes without a date."""
+    """Up to the limit, counted from the start; then objects are sent without a date."""
     began_ns = clocks.boot_ns()
     assert offsets.of('this-boot', began_ns) is None
     clocks.wait(HOLD_S)
@@ -133,7 +133,7 @@ def test_dating_waits_while_the_clock_is_not_set(clocks: Clocks, offsets: UtcOff
 
 
 def test_the_current_clock_dates_objects_of_this_boot(clocks: Clocks, offsets: UtcOffsets) -> None:
-    """Whatever was noted of it, and however long it has waited; a correction counts from then on."""
+    """Whatever was recorded for this boot, and however long they have waited; a correction counts from then on."""
     began_ns = clocks.boot_ns()
     clocks.wait(2 * HOLD_S)
     clocks.set()
@@ -143,7 +143,7 @@ def test_the_current_clock_dates_objects_of_this_boot(clocks: Clocks, offsets: U
 
 
 def test_a_clock_that_is_lost_again_dates_nothing(clocks: Clocks, offsets: UtcOffsets) -> None:
-    """It was set, and is back in 1970: what is taken now waits anew."""
+    """It was set, and is back in 1970: new objects wait again."""
     clocks.set()
     clocks.wait(2 * HOLD_S)
     clocks.set(5 * SECOND)
@@ -152,7 +152,7 @@ def test_a_clock_that_is_lost_again_dates_nothing(clocks: Clocks, offsets: UtcOf
 
 @pytest.mark.parametrize('is_set', [False, True])
 def test_objects_of_an_earlier_boot_are_not_waited_for(clocks: Clocks, offsets: UtcOffsets, is_set: bool) -> None:
-    """What was noted of its clock dates it; else nobody will ever know. It waits for nothing, whatever the clock shows now."""
+    """The recorded offset dates them; otherwise their date stays unknown. They do not wait, whatever the clock shows now."""
     if is_set:
         clocks.set()
     assert offsets.of('known-boot', clocks.boot_ns()) == KNOWN_NS

@@ -1,4 +1,4 @@
-"""Settings from any parameters and any environment: either they are refused by name, or everything they promise works."""
+"""Settings from any parameters and any environment: either they are refused by name, or they work as documented."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from shadowhound_data_logger.core.options import GIBI
 
 
 def load(environ: dict[str, str] | None = None, namespace: str = '/', **parameters: Any) -> Settings:
-    """Settings from parameters in Python's spelling: camera__rate_hz."""
+    """Settings from parameters as Python names: camera__rate_hz."""
     return Settings.load({name.replace('__', '.'): value for name, value in parameters.items()}, environ or {}, namespace)
 
 
 def refused(**parameters: Any) -> SettingError:
-    """The error that these parameters stop the start with."""
+    """The error that these parameters cause at startup."""
     with pytest.raises(SettingError) as caught:
         load(**parameters)
     return caught.value
 
 
 def test_no_setting_is_required() -> None:
-    """With nothing set the robot has the name of its host, the store is a folder, and all sensors of the Go2 are logged."""
+    """Without settings the robot has the name of its host, the store is a folder, and all sensors of the Go2 are logged."""
     settings = load()
     assert settings.robot == re.sub(r'[^A-Za-z0-9_-]', '_', socket.gethostname()).strip('_-')
     assert settings.home == Path('~/.shadowhound').expanduser()
@@ -47,7 +47,7 @@ def test_no_setting_is_required() -> None:
 
 
 def test_the_defaults_can_be_spelled_out() -> None:
-    """Giving every parameter its default changes nothing, but that listed sensors are all that is logged."""
+    """Setting every parameter to its default changes nothing, except that only listed sensors are logged."""
     given = default_parameters()
     spelled_out = Settings.load(given, {})
     assert spelled_out.capture.topics == 'sensors'
@@ -63,7 +63,7 @@ def test_the_defaults_can_be_spelled_out() -> None:
 def test_the_robot_name_comes_from_parameter_environment_or_host(
     given: str, environ: dict[str, str], namespace: str, robot: str
 ) -> None:
-    """The parameter comes before the variable, and that before the namespace."""
+    """The parameter takes precedence over the variable, and the variable over the namespace."""
     assert load(environ, namespace, robot=given).robot == robot
 
 
@@ -74,7 +74,7 @@ def test_the_robot_name_comes_from_parameter_environment_or_host(
 def test_a_robot_without_a_name_gets_the_default(
     host: str, package: str | None, robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is called thor where the messages of a Go2 are installed, and as its host otherwise."""
+    """It is called thor if the messages of a Go2 are installed, and like its host otherwise."""
     monkeypatch.setattr(socket, 'gethostname', lambda: host)
     if package is not None:
         (tmp_path / 'share' / package).mkdir(parents=True)
@@ -83,12 +83,12 @@ def test_a_robot_without_a_name_gets_the_default(
 
 @pytest.mark.parametrize('value', ['../thor', 'a b', 'x' * 65, 7])
 def test_an_invalid_robot_name_is_refused(value: object) -> None:
-    """A robot name that could not lead a key is refused with itself."""
+    """The error contains the invalid name."""
     assert refused(robot=value).data['value'] == value
 
 
 def test_an_invalid_robot_name_names_its_variable() -> None:
-    """Who set SHADOWHOUND_ROBOT finds no parameter ``robot`` in the file."""
+    """If SHADOWHOUND_ROBOT is set, the file has no parameter ``robot`` to fix."""
     with pytest.raises(SettingError, match="SHADOWHOUND_ROBOT = 'Thor 1' is refused; allowed is a name: use letters"):
         load({'SHADOWHOUND_ROBOT': 'Thor 1'})
 
@@ -109,7 +109,7 @@ def test_an_invalid_robot_name_names_its_variable() -> None:
     ('sensors', ['a', 'a'], 'each once'),
 ])  # fmt: skip
 def test_a_wrong_value_stops_the_start(name: str, value: object, allowed: str) -> None:
-    """The error names the parameter, the value and what is allowed, in words and as data."""
+    """The error names the parameter, the value and what is allowed, as text and as data."""
     error = refused(**{name: value})
     assert error.data['name'] == name
     assert repr(value) in str(error)
@@ -122,7 +122,7 @@ def test_a_wrong_value_stops_the_start(name: str, value: object, allowed: str) -
     ('camera.name', 'camera.topics'), ('camera', 'camera.rate_hz'), ('thermal.topics', "add it to 'sensors'"),
 ])  # fmt: skip
 def test_an_unknown_parameter_stops_the_start(name: str, near: str) -> None:
-    """The error names the parameter, its value and those that could have been meant."""
+    """The error names the parameter, its value and similar valid ones."""
     error = refused(**{name: 4711})
     assert error.data['name'] == name
     assert '4711' in str(error)
@@ -131,7 +131,7 @@ def test_an_unknown_parameter_stops_the_start(name: str, near: str) -> None:
 
 @pytest.mark.parametrize('name', ['robot', 'spool', 'a/b', '', 'use_sim_time'])
 def test_sensor_names_are_unique(name: str) -> None:
-    """A sensor that would be mistaken for another parameter or a folder is refused."""
+    """A sensor with the name of another parameter or a folder is refused."""
     assert refused(sensors=[name]).data['name'] == 'sensors'
 
 
@@ -143,7 +143,7 @@ def test_a_topic_has_one_sensor() -> None:
 
 
 def test_a_custom_sensor_takes_any_topic() -> None:
-    """A sensor that is not a default takes any topic; whole numbers pass where fractions are allowed."""
+    """It is logged like a default sensor; integers are accepted for floats."""
     (sensor,) = load(sensors=['thermal'], thermal__topics=['thermal/raw'], thermal__rate_hz=2).sensors
     assert (sensor.name, sensor.topics, sensor.rate_hz, sensor.period_ns) == ('thermal', ('thermal/raw',), 2.0, 500_000_000)
 
@@ -156,7 +156,7 @@ def test_an_archive_needs_a_batch() -> None:
 
 
 def test_keys_are_as_fine_as_the_shortest_time_between_two_objects() -> None:
-    """Names go by the batch, else by the rate."""
+    """Keys have the resolution of the batch, or otherwise of the rate."""
     imu = {'imu__rate_hz': 0.0, 'imu__batch_s': 10.0}
     assert load(**imu).sensors[3].period_ns == 10_000_000_000
     assert load(imu__rate_hz=4.0, imu__batch_s=0.0).sensors[3].period_ns == 250_000_000
@@ -164,7 +164,7 @@ def test_keys_are_as_fine_as_the_shortest_time_between_two_objects() -> None:
 
 
 def test_parameters_of_ros_itself_are_not_ours() -> None:
-    """What rclpy declares for every node is passed over."""
+    """Parameters that rclpy declares for every node are ignored."""
     assert load(use_sim_time=True, qos_overrides__imu__depth=5) == load()
 
 
@@ -175,7 +175,7 @@ ENVIRON = {
 
 
 def test_the_environment_names_the_store() -> None:
-    """Endpoint, credentials and folder come from the environment."""
+    """Endpoint, credentials and folder."""
     settings = load(ENVIRON)
     assert settings.store.endpoint_url == 'http://tower:9000'
     assert (settings.store.access_key_id, settings.store.secret_access_key) == ('the-key-id', 'the-secret')
@@ -183,7 +183,7 @@ def test_the_environment_names_the_store() -> None:
 
 
 def test_secrets_are_not_shown() -> None:
-    """No secret stands in the text of the settings, which end up in logs."""
+    """No secret is in the text of the settings, which is logged."""
     for text in (repr(load(ENVIRON)), str(load(ENVIRON))):
         assert 'tower:9000' in text
         assert not any(secret in text for secret in ('the-key-id', 'the-secret', 'the-token'))
@@ -203,7 +203,7 @@ def test_an_endpoint_is_a_url() -> None:
 )  # fmt: skip
 @pytest.mark.parametrize('name', ['AWS_ENDPOINT_URL', 'AWS_ENDPOINT_URL_S3'])
 def test_an_endpoint_that_some_client_cannot_use_is_refused(name: str, url: str) -> None:
-    """With the name of its variable, and without a password that is in it."""
+    """With the name of its variable, and without the password in it."""
     with pytest.raises(SettingError) as caught:
         load({name: url})
     assert caught.value.data['name'] == name
@@ -221,14 +221,14 @@ def test_an_endpoint_that_some_client_cannot_use_is_refused(name: str, url: str)
      ({'AWS_ENDPOINT_URL': '', 'AWS_ENDPOINT_URL_S3': ''}, None)],
 )  # fmt: skip
 def test_the_endpoint_is_chosen_by_precedence(environ: dict[str, str], expected: str | None) -> None:
-    """AWS_ENDPOINT_URL_S3 before AWS_ENDPOINT_URL, as in botocore; slashes at the end do not count, an empty value is none."""
+    """AWS_ENDPOINT_URL_S3 before AWS_ENDPOINT_URL, as in botocore; trailing slashes are removed, an empty value is ignored."""
     assert load(environ).store.endpoint_url == expected
 
 
 @pytest.mark.parametrize('value', ['the-secret ', 'the-secret\n', 'a b', 'se\u00fcret', '\u200bkey'])
 @pytest.mark.parametrize('name', ['AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'AWS_SESSION_TOKEN'])
 def test_a_key_with_a_blank_is_refused_and_not_shown(name: str, value: str) -> None:
-    """It would be refused as a wrong signature, or not be a header at all."""
+    """It would be refused as a wrong signature, or be an invalid header."""
     with pytest.raises(SettingError, match='without blanks') as caught:
         load({**ENVIRON, name: value})
     assert caught.value.data['name'] == name
@@ -237,7 +237,7 @@ def test_a_key_with_a_blank_is_refused_and_not_shown(name: str, value: str) -> N
 
 @pytest.mark.parametrize('name', ['AWS_REGION', 'AWS_DEFAULT_REGION'])
 def test_a_region_with_a_blank_is_refused(name: str) -> None:
-    """It is part of what is signed."""
+    """It is part of the signature."""
     with pytest.raises(SettingError, match=f"{name} = 'us-east-1 '"):
         load({name: 'us-east-1 '})
     assert load({name: 'eu-central-1'}).store.region == 'eu-central-1'
@@ -245,7 +245,7 @@ def test_a_region_with_a_blank_is_refused(name: str) -> None:
 
 @pytest.mark.parametrize('given', ['lowstate', 'lowstate:', ':soc', 'lowstate:bms_state..soc', 'a b:c', 'a:b:c'])
 def test_a_field_needs_a_topic_and_a_name(given: str) -> None:
-    """The node says at its start what it could never find in a message."""
+    """The node reports at startup a field that cannot exist in a message."""
     error = refused(mission__battery=given)
     assert (error.data['name'], error.data['value']) == ('mission.battery', given)
     assert load(mission__battery='', mission__temperature='low/state:motor_state.0.temperature')
@@ -270,7 +270,7 @@ VARIABLES = ('AWS_ENDPOINT_URL', 'AWS_REGION', 'AWS_SECRET_ACCESS_KEY', 'SHADOWH
 
 
 def loaded(parameters: dict[str, Any], environ: dict[str, str], namespace: str = '/') -> Settings | None:
-    """The settings; None where they were refused with the name of what is wrong, in words that can be printed."""
+    """The settings; None if they were refused with the name of the invalid one, in printable text."""
     try:
         return Settings.load(parameters, environ, namespace)
     except SettingError as error:
@@ -287,7 +287,7 @@ def loaded(parameters: dict[str, Any], environ: dict[str, str], namespace: str =
 @example({'spool.max_bytes': 10**400})
 @example({'sensors': ['a'], 'a.topics': ['b'], 'a.key': '{robot}/{date}/{time}{sensor.name}'})
 def test_any_accepted_parameters_work(parameters: dict[str, Any]) -> None:
-    """Whatever is accepted names safe keys at any time, and periods that can be counted."""
+    """Accepted parameters give safe keys at any time, and valid periods."""
     found = loaded(parameters, {})
     if found is None:
         return
@@ -304,7 +304,7 @@ def test_any_accepted_parameters_work(parameters: dict[str, Any]) -> None:
 @given(st.dictionaries(st.sampled_from(VARIABLES), TEXT, max_size=5), TEXT)
 @example({'SHADOWHOUND_HOME': '~nobody-of-this-name/x'}, '/')
 def test_any_accepted_environment_works(environ: dict[str, str], namespace: str) -> None:
-    """What is accepted has an absolute folder and a robot that is a word."""
+    """An accepted environment has an absolute folder and a valid robot name."""
     found = loaded({}, environ, namespace)
     if found is not None:
         assert found.spool_path.is_absolute()
@@ -314,5 +314,5 @@ def test_any_accepted_environment_works(environ: dict[str, str], namespace: str)
 @settings(derandomize=True, deadline=None, max_examples=examples(600))
 @given(name=st.sampled_from(KNOWN), value=VALUES)
 def test_each_parameter_takes_a_value_or_refuses_it_by_name(name: str, value: Any) -> None:
-    """Each parameter that there is takes a value of its kind, or refuses it by its name."""
+    """For each existing parameter, and a value of its type."""
     loaded({name: value}, {})

@@ -44,13 +44,13 @@ FULL = NodeStatus(
 
 @pytest.mark.parametrize('status', [NodeStatus(), FULL])
 def test_a_status_is_read_as_it_was_written(status: NodeStatus) -> None:
-    """With everything in it, and with nothing in it."""
+    """With all fields set, and with none."""
     assert parse(NodeStatus, json.loads(dumps(status))) == status
     assert json.loads(dumps(status)) == as_plain(status)
 
 
 def test_a_false_dataclass_is_an_empty_object() -> None:
-    """No mission and no trigger have no fields."""
+    """A missing mission or trigger has no fields."""
     plain = as_plain(NodeStatus())
     assert (plain['mission'], plain['events']['last']) == ({}, {})
 

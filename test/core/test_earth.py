@@ -7,7 +7,7 @@ import pytest
 from shadowhound_data_logger.core.earth import is_place, is_within
 
 DEGREE_M = 111_195.08
-"""Of a great circle on the sphere."""
+"""Length of a great circle on the sphere."""
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ DEGREE_M = 111_195.08
     ],
 )
 def test_distances_on_earth_are_exact(one: tuple[float, float], other: tuple[float, float], meters: float) -> None:
-    """A place is within a little more than its distance, and not within a little less."""
+    """A position is within slightly more than its distance, and not within slightly less."""
     assert is_within(*one, *other, meters * 1.001 + 0.1)
     assert is_within(*other, *one, meters * 1.001 + 0.1)
     assert meters == 0.0 or not is_within(*one, *other, meters * 0.999 - 0.1)

@@ -29,7 +29,7 @@ LOW = 'low_battery: lowstate:bms_state.soc < 20 for 5'
 
 
 def test_a_condition_is_parsed() -> None:
-    """Name, topic, field, comparison, threshold and hold time, whatever the blanks."""
+    """Name, topic, field, comparison, threshold and hold time, with any white space."""
     test = Comparison('lowstate:bms_state.soc < 20 for 5', 'lowstate', 'bms_state.soc', '<', 20.0, 5.0)
     assert conditions([LOW]) == (Condition('low_battery', test),)
     (other,) = conditions(['hot:/r0/lowstate:motor_state.3.temperature>=-7.5e1  for 0.5 s'])
@@ -42,7 +42,7 @@ def test_a_condition_is_parsed() -> None:
     ('<', {1}), ('<=', {1, 2}), ('>', {3}), ('>=', {2, 3}), ('==', {2}), ('!=', {1, 3}),
 ])  # fmt: skip
 def test_each_comparison_holds_as_its_sign_states(sign: str, holding: set[int]) -> None:
-    """Holds for the numbers that its sign says."""
+    """For each comparison operator."""
     (condition,) = conditions([f'x: t:f {sign} 2'])
     assert {value for value in (1, 2, 3) if condition.test.holds(value)} == holding
 
@@ -72,7 +72,7 @@ def test_an_invalid_expression_aborts_startup(text: str) -> None:
     ('events.pre_s', {'events.pre_s': math.nan}),
 ])  # fmt: skip
 def test_a_senseless_expression_aborts_startup(name: str, given: dict[str, object]) -> None:
-    """A name twice, conditions without anything to keep, an event shorter than its end, what is not an expression."""
+    """A duplicate name, conditions without data to keep, an event shorter than the time after it, an invalid expression."""
     with pytest.raises(SettingError) as refused:
         Settings.load(given, {})
     assert refused.value.data['name'] == name
@@ -84,7 +84,7 @@ SIGN = st.sampled_from(['<', '<=', '>', '>=', '==', '!='])
 
 
 def spelled(draw: st.DrawFn, depth: int) -> str:
-    """A random expression over all of the language."""
+    """A random expression using the complete language."""
     kind = draw(st.integers(0, 6 if depth else 4))
     if kind == 0:
         return f'{draw(NAMES)}.{draw(PATHS)} {draw(SIGN)} {draw(st.floats(-1e6, 1e6))!r}'
@@ -102,7 +102,7 @@ def spelled(draw: st.DrawFn, depth: int) -> str:
 
 @given(st.data())
 def test_an_expression_that_is_spelled_out_is_the_same(data: st.DataObject) -> None:
-    """``text_of`` writes what ``parse`` reads, with the same tests in the same order."""
+    """``parse`` reads the output of ``text_of`` as the same tests in the same order."""
     found = parse(spelled(data.draw, 3), 'x', PARTS)
     again = parse(text_of(found), 'x', PARTS)
     assert list(leaves(again)) == list(leaves(found))
@@ -111,7 +111,7 @@ def test_an_expression_that_is_spelled_out_is_the_same(data: st.DataObject) -> N
 
 @given(st.text(alphabet='abm:.()<>=!"\'09 andortime22:00-wifi.ssid*', max_size=60))
 def test_any_text_is_an_expression_or_a_clear_error(text: str) -> None:
-    """Never another error."""
+    """There is no other error."""
     with suppress(SettingError):
         assert list(leaves(parse(text, 'x', PARTS)))
 
@@ -123,7 +123,7 @@ def test_any_text_is_an_expression_or_a_clear_error(text: str) -> None:
     ('wifi.ssid > "lab"', MACHINE, 'character 11'), ('', MACHINE, 'character 1'), ('objects', STORED, 'character 1'),
 ])  # fmt: skip
 def test_an_error_names_the_position_and_what_is_expected(text: str, allowed: frozenset[str], position: str) -> None:
-    """What one setting can evaluate another may not: that is named as well."""
+    """The error also names expressions that one setting allows and another does not."""
     with pytest.raises(SettingError) as refused:
         parse(text, 'upload.when', allowed)
     assert position in refused.value.data['allowed']
@@ -137,5 +137,5 @@ def test_hostile_expressions_are_bounded(text: str) -> None:
 
 
 def test_the_functions_are_those_of_the_statistics() -> None:
-    """Of the catalog; the expression language imports nothing of formats."""
+    """As in the catalog; the expression language imports nothing from formats."""
     assert FUNCTIONS == NUMBERS

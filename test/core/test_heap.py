@@ -1,4 +1,4 @@
-"""Whether freed blocks stay with the process: page faults of children, since the options hold for a whole process."""
+"""Whether the process keeps freed blocks: page faults of child processes, since the options affect a whole process."""
 
 from __future__ import annotations
 

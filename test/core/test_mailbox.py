@@ -1,4 +1,4 @@
-"""Whatever a mailbox contains, an entry is refused, or it is a request that round-trips."""
+"""An entry of a mailbox with any contents is refused, or is a request that round-trips."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ANYTHING = st.recursive(
     st.sampled_from(['sensor', 'topic', 'mission', 'mission_type', 'since_ns', 'until_ns', 'near', 'keys']), ANYTHING, max_size=3,
 ))  # fmt: skip
 def test_an_entry_is_rejected_or_round_trips(changed: dict[str, Any], want: dict[str, Any] | None) -> None:
-    """With surrogates, NaN, huge numbers and nests in any place, an id that is the hash of them or not."""
+    """With surrogates, NaN, huge numbers and deep nesting anywhere, and with valid and invalid ids."""
     entry = {**GOOD, **changed}
     if want is not None:
         entry |= {'want': want, 'id': request_id('thor', want)}
@@ -45,7 +45,7 @@ def test_an_entry_is_rejected_or_round_trips(changed: dict[str, Any], want: dict
     [['tachi/camera/20251018/000001_front.jpg'], ['../../../../etc/passwd', '/etc/passwd'], ['tachi/*'], ['*/../index.db']],
 )
 def test_keys_that_the_robot_does_not_keep_match_nothing(tmp_path: Path, keys: list[str]) -> None:
-    """A key is compared with those of what is kept, and never opened: the request is done, and found nothing."""
+    """A key is compared with those of kept objects, and never opened: the request completes without a result."""
     desk = Desk(tmp_path / 'spool')
     desk.keeps(frame(1))
     wild = tuple(key for key in keys if '*' in key)

@@ -1,4 +1,4 @@
-"""The few requests to MLflow without its client: a hostile server gets no password and breaks nothing."""
+"""Requests to MLflow without its client: a hostile server gets no password and breaks nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LOGIN = {'MLFLOW_TRACKING_USERNAME': 'thor', 'MLFLOW_TRACKING_PASSWORD': 'secret
 
 @contextmanager
 def answering(status: int, body: bytes = b'', headers: Mapping[str, str] | None = None) -> Iterator[tuple[str, list[str | None]]]:
-    """A server with one answer, and the passwords that it was shown."""
+    """A server with one response, and the passwords that it received."""
     shown: list[str | None] = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -47,7 +47,7 @@ def answering(status: int, body: bytes = b'', headers: Mapping[str, str] | None 
 
 
 def test_a_redirect_is_not_followed(tmp_path: Path) -> None:
-    """Whoever it leads to is not told the password, whatever else he is told."""
+    """Its target does not receive the password, whatever else the request contains."""
     with answering(200, b'{}') as (other, shown), answering(302, headers={'Location': other}) as (url, _):
         with pytest.raises(TrackingRefused, match='302'):
             MlflowRest(url, LOGIN, tmp_path).json('GET', 'runs/get')
@@ -57,7 +57,7 @@ def test_a_redirect_is_not_followed(tmp_path: Path) -> None:
 @pytest.mark.parametrize('status', [200, 400, 503])
 @pytest.mark.parametrize('broken', [b'zz\r\n', b'5\r\n{', b'-5\r\n', b''])
 def test_an_incomplete_answer_is_an_error(tmp_path: Path, status: int, broken: bytes) -> None:
-    """Is one of ours as well, whether it was to be an error or not."""
+    """It is one of our errors, whether or not the status is one."""
     chunked = {'Transfer-Encoding': 'chunked', 'Connection': 'close'}
     with answering(status, broken, chunked) as (url, _), pytest.raises(TrackingError):
         MlflowRest(url, LOGIN, tmp_path).json('GET', 'runs/get')
@@ -65,7 +65,7 @@ def test_an_incomplete_answer_is_an_error(tmp_path: Path, status: int, broken: b
 
 @pytest.mark.parametrize('body', [b'[' * 200_000, b'[]', b'\xff', b'{"error_code": 5}'])
 def test_an_error_of_another_server_is_reported(tmp_path: Path, body: bytes) -> None:
-    """Is one of ours, whatever its body is."""
+    """It is one of our errors, whatever the body."""
     with answering(400, body) as (url, _), pytest.raises(TrackingRefused) as refused:
         MlflowRest(url, LOGIN, tmp_path).json('GET', 'runs/get')
     assert 'secret' not in str(refused.value)

@@ -12,7 +12,7 @@ NAME = 'capture.rmw'
 
 
 def test_the_last_argument_counts(tmp_path: Path) -> None:
-    """Files and single parameters in their order; what is before --ros-args or after -- is none of it."""
+    """Files and individual parameters in order; arguments before --ros-args or after -- are ignored."""
     file = tmp_path / 'a.yaml'
     file.write_text('/**:\n  ros__parameters: {capture: {rmw: robot}}\n')
     ros = ['--ros-args', '--params-file', str(file)]
@@ -37,7 +37,7 @@ def test_the_last_argument_counts(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_only_sections_of_this_node_apply(section: str, namespace: str, counts: bool, tmp_path: Path) -> None:
-    """By the full name of the node, with rcl's wild cards."""
+    """By the node's full name, with rcl's wildcards."""
     file = tmp_path / 'a.yaml'
     file.write_text(f'"{section}":\n  ros__parameters:\n    capture.rmw: robot\n')
     arguments = ['--ros-args', '-r', f'__ns:={namespace or "/"}', '--params-file', str(file)]
@@ -45,7 +45,7 @@ def test_only_sections_of_this_node_apply(section: str, namespace: str, counts: 
 
 
 def test_namespaces_are_nested_keys(tmp_path: Path) -> None:
-    """A namespace may be a key of its own, above the node's; without a name to ask for, every namespace will do."""
+    """A namespace may be a key above the node's; without a name to look for, every namespace matches."""
     file = tmp_path / 'a.yaml'
     file.write_text('tachi:\n  sensor_logger_node:\n    ros__parameters: {robot: tachi}\nother:\n  ros__parameters: {robot: x}\n')
     assert read_parameters(file) == read_parameters(file, '/tachi/sensor_logger_node') == {'robot': 'tachi'}
@@ -54,7 +54,7 @@ def test_namespaces_are_nested_keys(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('text', ['sensor_logger_node: {}', 'a: [', '3', 'a: {b: {c: 1}}'])
 def test_an_invalid_parameter_file_is_refused(text: str, tmp_path: Path) -> None:
-    """It says so, and which."""
+    """The error names it."""
     file = tmp_path / 'a.yaml'
     file.write_text(text)
     with pytest.raises(ParametersUnreadable, match=r'a\.yaml is not a parameter file'):
@@ -62,7 +62,7 @@ def test_an_invalid_parameter_file_is_refused(text: str, tmp_path: Path) -> None
 
 
 def test_remapping_rules_for_other_nodes_do_not_apply() -> None:
-    """Without its name; those for all nodes or for another one are not among them, nor one for a topic of that name."""
+    """Without the node's name; rules for all nodes, for another one, or for a topic of that name are not returned."""
     arguments = [
         '-r',
         'a:x:=/no',

@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.rules import Rule, RuleResult, read_rule
 
 @dataclass
 class Known:
-    """What a test says there is."""
+    """The values that a test sets as known."""
 
     numbers: dict[str, float] = field(default_factory=dict)
     ssids: Collection[str] | str = ()
@@ -99,7 +99,7 @@ def test_a_number_must_hold_for_its_time() -> None:
 
 
 def test_every_part_is_evaluated_even_where_one_decides() -> None:
-    """Else the time for which a number has to hold would begin when the other part changes."""
+    """Otherwise the hold time of a number would start when the other part changes."""
     rule, known = read('mission and soc:data > 30 for 5'), Known({'soc:data': 31.0})
     assert not rule.evaluate(known, 0.0).holds
     known.type = 'patrol'

@@ -1,4 +1,4 @@
-"""Which time a message gets, by who publishes it and how well the clocks are set."""
+"""The time of a message, depending on its publisher and on whether the clocks are set."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ WEEK_NS = 7 * DAY_NS
     pytest.param(NOW_NS - WEEK_NS, NOW_NS, 0, Dated(NOW_NS, 'stamp_too_old'), id='a middleware that tells no arrival'),
 ])  # fmt: skip
 def test_a_message_is_dated_by_its_stamp_or_its_arrival(header_ns: int, source_ns: int, received_ns: int, dated: Dated) -> None:
-    """A message's own time counts within the bound on both sides of its arrival; otherwise the arrival does, with the reason."""
+    """A message's stamp counts within the limit on both sides of its arrival; otherwise the arrival does, with the reason."""
     clocks = Clocks()
     clocks.set(NOW_NS)
     assert StampRule(clocks).date(header_ns, source_ns, received_ns) == dated
@@ -66,13 +66,13 @@ def test_a_message_is_dated_by_its_stamp_or_its_arrival(header_ns: int, source_n
     pytest.param(NOW_NS + WEEK_NS, NOW_NS, Dated(NOW_NS, 'stamp_ahead'), id='it knows the time, and its stamp is ahead'),
 ])  # fmt: skip
 def test_while_the_clock_is_not_set_the_best_available_time_is_used(header_ns: int, source_ns: int, dated: Dated) -> None:
-    """UTC by another machine that knows it; otherwise the boot clock's time, that of the sending where it can be known."""
+    """UTC from another machine that has it; otherwise the boot clock's time, of sending if it can be known."""
     clocks = Clocks()
     assert StampRule(clocks).date(header_ns, source_ns, clocks.wall_ns()) == dated
 
 
 def test_the_maximum_offset_can_be_raised() -> None:
-    """Whoever replays the bags of a year keeps their stamps, and still trusts none beyond it."""
+    """Replaying old bags keeps their stamps, and none beyond the offset is trusted."""
     rule = StampRule(Clocks(), 365 * DAY_NS)
     assert rule.date(NOW_NS - 364 * DAY_NS, NOW_NS, NOW_NS) == Dated(NOW_NS - 364 * DAY_NS)
     assert rule.date(NOW_NS - 366 * DAY_NS, NOW_NS, NOW_NS) == Dated(NOW_NS, 'stamp_too_old')
@@ -84,7 +84,7 @@ random_ = random.Random(5)
 
 
 def follow(track: StampTrack, offsets_ns: Iterable[int], period_ns: int = PERIOD_NS, start_ns: int = NOW_NS) -> list[str]:
-    """What each message was refused for, if stamps are this much before their arrival; trusted ones keep their stamp."""
+    """The reason for each rejected stamp, if stamps are this much before their arrival; trusted ones are used."""
     found = []
     for number, offset_ns in enumerate(offsets_ns):
         received_ns = start_ns + number * period_ns
@@ -114,7 +114,7 @@ def new_track() -> StampTrack:
     pytest.param([5 * MS] * 100 + [(30 - late) * PERIOD_NS for late in range(30)] + [5 * MS] * 9, 0, 'stable', id='late by 1 s'),
 ])  # fmt: skip
 def test_stamps_are_trusted_while_their_offset_is_stable(offsets_ns: list[int], refused: int, state: str) -> None:
-    """However large it is; a new offset counts when some messages in a row have it, a stray stamp does not."""
+    """However large it is; a new offset counts when several consecutive messages have it, a stray stamp does not."""
     track = new_track()
     assert sum(map(bool, follow(track, offsets_ns))) == refused
     assert track.state == state
@@ -125,7 +125,7 @@ def test_stamps_are_trusted_while_their_offset_is_stable(offsets_ns: list[int], 
     pytest.param(lambda: random_.choice((0, 300 * SECOND)), id='two clocks that nobody tells apart'),
 ])  # fmt: skip
 def test_erratic_stamps_are_dated_by_arrival(offset: Callable[[], int]) -> None:
-    """All of them, even those that happen to be near their arrival. They are trusted again once they are stable."""
+    """All of them, even those that happen to be close to their arrival. They are trusted again once they are stable."""
     track = new_track()
     found = follow(track, [offset() for _ in range(500)])
     assert set(found[2 * RECENT :]) == {'stamp_erratic'}
@@ -146,7 +146,7 @@ def test_messages_delayed_by_a_queue_keep_their_stamps() -> None:
 
 @pytest.mark.parametrize('usual_ns', [5 * MS, 146 * SECOND])
 def test_messages_of_a_draining_queue_keep_their_stamps(usual_ns: int) -> None:
-    """Four seconds without any, then all of them within milliseconds, twice; after that the usual offset is known again."""
+    """Four seconds without any, then all of them within milliseconds, twice; after that the usual offset is recognized again."""
     track = new_track()
     follow(track, [usual_ns] * 60)
     for begin_ns in (NOW_NS + 6 * SECOND, NOW_NS + 12 * SECOND):
@@ -160,7 +160,7 @@ def test_messages_of_a_draining_queue_keep_their_stamps(usual_ns: int) -> None:
 
 @pytest.mark.parametrize('hz', [1, 30, 1000])
 def test_stamps_that_do_not_advance_are_stuck(hz: int) -> None:
-    """A second after the last that did, at whatever rate; repeats within a second are none of our business."""
+    """A second after the last one that advanced, at any rate; repeats within a second are normal."""
     track, period_ns = new_track(), SECOND // hz
     follow(track, [MS] * 10, period_ns)
     found = follow(track, accumulate([MS] + [period_ns] * (5 * hz)), period_ns, NOW_NS + 10 * period_ns)
@@ -174,13 +174,13 @@ def test_stamps_that_do_not_advance_are_stuck(hz: int) -> None:
 
 
 def test_a_latched_message_keeps_its_stamp() -> None:
-    """It was sent long before it was received; so does the next one, which comes at once."""
+    """It was sent long before it was received; the next one, which arrives immediately, keeps its stamp, too."""
     track = new_track()
     assert follow(track, [600 * SECOND, 2 * MS], 60 * SECOND) == ['', '']
 
 
 def test_the_state_has_its_beginning() -> None:
-    """By the arrival; the offset and how far messages are from it are known, and that of the time of sending beside them."""
+    """By arrival; with the offset and the deviation of messages from it, and the same for the send time."""
     track = new_track()
     follow(track, [5 * MS] * 10)
     follow(track, [60 * SECOND] * 50, start_ns=NOW_NS + 10 * PERIOD_NS)
@@ -190,7 +190,7 @@ def test_the_state_has_its_beginning() -> None:
 
 
 def test_sim_time_is_reported_as_such() -> None:
-    """A stamp before 2024 is refused by the bound, and named as the state."""
+    """A stamp before 2024 is rejected by the limit, and reported as the state."""
     track = new_track()
     assert track.date(70 * SECOND, NOW_NS, NOW_NS) == Dated(NOW_NS, 'stamp_before_2024')
     assert track.state == 'before_2024'
@@ -205,7 +205,7 @@ def test_sim_time_is_reported_as_such() -> None:
     pytest.param(1.7e9, 0.0, 'before_2024', 'sim_time', id='sim time'),
 ])  # fmt: skip
 def test_the_likely_cause_is_reported(stamp_s: float, sent_s: float, state: str, cause: str) -> None:
-    """From the time of sending, which the publisher's own clock gives: if it is as far off, that clock is."""
+    """From the send time, which the publisher's clock gives: if it has the same offset, that clock is wrong."""
     clocks = Clocks()
     clocks.set(NOW_NS)
     tracks = StampTracks(StampRule(clocks))
@@ -222,7 +222,7 @@ def test_the_likely_cause_is_reported(stamp_s: float, sent_s: float, state: str,
 
 
 def test_stable_and_latched_stamps_are_not_reported() -> None:
-    """A message that was sent an hour ago says nothing about a clock; nor does a publisher that is silent now."""
+    """A message sent an hour ago is no evidence about a clock; nor is a publisher that is silent now."""
     clocks = Clocks()
     clocks.set(NOW_NS)
     tracks = StampTracks(StampRule(clocks))

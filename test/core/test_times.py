@@ -1,4 +1,4 @@
-"""Times as people write them become nanoseconds, by one grammar everywhere."""
+"""Times as users write them become nanoseconds, by one grammar everywhere."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ T0 = 1_760_788_800 * SECOND
     ],
 )  # fmt: skip
 def test_times_are_read_in_words(text: str | datetime, ns: int) -> None:
-    """UTC unless a zone is named; a date is its beginning."""
+    """UTC unless a zone is given; a date is its start."""
     assert moment('since', text, NOON_NS) == ns
 
 
@@ -77,7 +77,7 @@ def test_times_that_python_writes_are_read(time: datetime, minutes: int) -> None
 
 @pytest.mark.long('a process for each')
 def test_times_agree_with_gnu_date() -> None:
-    """On what both read."""
+    """For times that both can read."""
     for text in ('2026-10-28T14:00:00+02:00', '2025-02-28 23:59:59', '20240229', '1969-12-31T23:59:59Z'):
         told = subprocess.run(['date', '-u', '-d', text, '+%s'], capture_output=True, text=True, check=True)
         assert moment('since', text, NOON_NS) == int(told.stdout) * SECOND

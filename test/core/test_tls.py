@@ -1,7 +1,7 @@
-"""TLS: each client of a server, and each server of ours, by the same rules.
+"""TLS: each client of a server, and each of our servers, by the same rules.
 
-A client trusts a server whose certificate its operator's authority signed. Any other certificate is an error that names what is
-wrong and what to set; until it is replaced nothing is sent, in clear or otherwise.
+A client trusts a server with a certificate signed by its operator's CA. Any other certificate is an error that names the
+problem and the setting; until it is replaced nothing is sent, in clear text or otherwise.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ Ask = Callable[[], object]
 
 
 def assert_only_tls(server: Secured, *words: bytes) -> None:
-    """Nothing but TLS was on the wire, and none of these words, nor a request, could be read there."""
+    """Nothing but TLS was on the wire, and neither these texts nor a request could be read there."""
     assert server.wire.heard_by_connection
     assert all(heard[0] in RECORDS and heard[1] == 3 for heard in server.wire.heard_by_connection)
     assert not [word for word in (b'PUT /', b'AWS4-HMAC', b'authorization', *words) if word in server.wire.heard]
@@ -86,7 +86,7 @@ def assert_only_tls(server: Secured, *words: bytes) -> None:
 
 @dataclass(frozen=True)
 class Client:
-    """A client of a server: the requests that it sends, and the variables that its operator sets."""
+    """A client of a server: its requests, and the variables set by its operator."""
 
     asks: Callable[[str, Path, ExitStack], Sequence[Ask]]
     """The requests to the server at a URL."""
@@ -141,7 +141,7 @@ def client(request: pytest.FixtureRequest) -> Client:
 
 @pytest.fixture
 def trusting(authorities: dict[str, Authority], monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
-    """The environment of a client that trusts the authority by this variable alone, and asks the server at this URL."""
+    """The environment of a client that trusts the CA by this variable alone, with the server at this URL."""
 
     def trust(variable: str, url: str) -> None:
         for name in BUNDLES:
@@ -164,7 +164,7 @@ def test_a_wrong_certificate_is_named_and_nothing_is_sent(
     client: Client, kind: str, authorities: dict[str, Authority], trusting: Callable[[str, str], None],
     opened: ExitStack, tmp_path: Path,
 ) -> None:  # fmt: skip
-    """Each kind has its own words and its own remedy."""
+    """Each kind has a separate message and remedy."""
     signer, how, words, remedy = WRONG[kind]
     server = opened.enter_context(served(FakeS3()))
     front = opened.enter_context(behind_tls(server.url, authorities[signer].sign(kind, **how)))
@@ -183,7 +183,7 @@ def test_a_wrong_certificate_pauses_delivery() -> None:
 
 
 class Redirect(BaseHTTPRequestHandler):
-    """Sends every client to another server."""
+    """Redirects every client to another server."""
 
     target = ''
     asked = 0
@@ -208,7 +208,7 @@ class Redirect(BaseHTTPRequestHandler):
         self.answer()
 
     def log_message(self, *_: object) -> None:
-        """Quiet."""
+        """Log nothing."""
 
 
 @contextmanager
@@ -229,7 +229,7 @@ def redirecting(target: str) -> Iterator[tuple[str, type[Redirect]]]:
 def test_a_redirect_to_plain_http_is_not_followed(
     client: Client, authorities: dict[str, Authority], trusting: Callable[[str, str], None], opened: ExitStack, tmp_path: Path
 ) -> None:
-    """A trusted server cannot make a client send in clear: only the operator decides that."""
+    """A trusted server cannot make a client send in clear text: only the operator decides that."""
     elsewhere, there = opened.enter_context(redirecting('http://127.0.0.1:1'))
     url, here = opened.enter_context(redirecting(elsewhere))
     front = opened.enter_context(behind_tls(url, authorities['authority'].sign('redirects')))
@@ -246,7 +246,7 @@ def test_a_redirect_to_plain_http_is_not_followed(
 def test_delivery_trusts_a_private_authority(
     variable: str, authorities: dict[str, Authority], seaweed: Tower, trusting: Callable[[str, str], None], spool: Spool
 ) -> None:
-    """Puts, parts, looks, reads and lists go through TLS, and the wire shows none of it."""
+    """Puts, parts, checks, reads and lists use TLS, and the wire shows none of it."""
     with behind_tls(seaweed.endpoint_url, authorities['authority'].sign('good')) as front:
         trusting(variable, front.url)
         with store_at(seaweed, front.url) as store:
@@ -281,7 +281,7 @@ def spool(tmp_path: Path) -> Spool:
 
 @contextmanager
 def store_at(seaweed: Tower, url: str) -> Iterator[S3Store]:
-    """The store by another way to it."""
+    """The store with another address."""
     with closing(S3Store(replace(seaweed.store_settings(), endpoint_url=url), PATIENT)) as store:
         store.open()
         yield store
@@ -293,7 +293,7 @@ def test_the_lake_trusts_a_private_authority(
     authorities: dict[str, Authority], seaweed: Tower, trusting: Callable[[str, str], None], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Queries, fetches, the verification and datasets all go through TLS."""
+    """Queries, fetches, the verification and datasets all use TLS."""
     Drive(seaweed.store_settings(), tmp_path / 'drive', ROBOT).record(SECONDS)
     with behind_tls(seaweed.endpoint_url, authorities['authority'].sign('good')) as front:
         trusting('AWS_CA_BUNDLE', front.url)
@@ -314,7 +314,7 @@ def test_the_lake_trusts_a_private_authority(
 def test_without_a_bundle_the_authorities_of_the_system_decide(
     authorities: dict[str, Authority], trusting: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They do not include this authority, and the message names the variable."""
+    """They do not include this CA, and the message names the variable."""
     with served(FakeS3()) as server, behind_tls(server.url, authorities['authority'].sign('plain')) as front:
         trusting('AWS_CA_BUNDLE', front.url)
         monkeypatch.delenv('AWS_CA_BUNDLE')
@@ -393,7 +393,7 @@ def test_the_doctor_names_a_wrong_certificate(
 def test_the_doctor_accepts_a_certificate_of_the_trusted_authority(
     scene: Scene, authorities: dict[str, Authority], service: tuple[str, Client]
 ) -> None:
-    """By the variable of that client; behind TLS the server is known as well as without."""
+    """Each client by its variable; behind TLS the server is identified as well as without."""
     name, client = service
     scene.environ |= {client.bundle: str(authorities['authority'].path), 'AWS_ACCESS_KEY_ID': 'a', 'AWS_SECRET_ACCESS_KEY': 'b'}
     with served(FakeS3()) as server, behind_tls(server.url, authorities['authority'].sign('good')) as front:
@@ -405,14 +405,14 @@ def test_the_doctor_accepts_a_certificate_of_the_trusted_authority(
 
 
 def test_the_doctor_proposes_plain_http_where_the_port_has_no_tls(scene: Scene) -> None:
-    """With the address that works."""
+    """With the working URL."""
     with served(FakeS3()) as server:
         scene.environ['AWS_ENDPOINT_URL'] = server.url.replace('http:', 'https:')
         expect(scene.findings('network.s3'), 'network.s3.tls', f'export AWS_ENDPOINT_URL={server.url}')
 
 
 def test_the_doctor_names_a_bundle_that_is_missing(scene: Scene, authorities: dict[str, Authority]) -> None:
-    """It is no reason to doubt the server."""
+    """The server is not reported."""
     with served(FakeS3()) as server, behind_tls(server.url, authorities['authority'].sign('good')) as front:
         scene.environ |= {'AWS_ENDPOINT_URL': front.url, 'AWS_CA_BUNDLE': '/nowhere/ca.pem'}
         expect(scene.findings('network.s3'), 'network.s3.tls', 'ls -l /nowhere/ca.pem')
@@ -423,7 +423,7 @@ def test_the_doctor_names_a_bundle_that_is_missing(scene: Scene, authorities: di
 
 @asynccontextmanager
 async def secured(folder: Path, certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[LiveServer]:
-    """A robot's page behind https, for whoever has a token."""
+    """A robot's page with https, for users with a token."""
     monkeypatch.setattr(live_server, 'find_spec', lambda _: None)  # no ROS here
     settings = LiveSettings(
         spool=folder / 'spool', robot='thor', tokens=folder / 'live', bind='0.0.0.0', port=0, certificate=certificate
@@ -444,7 +444,7 @@ async def looks_at(server: LiveServer, token: str, authority: Path) -> None:
     """Sign in and watch, over https alone."""
     origin = f'https://127.0.0.1:{server.port}'
     connector = aiohttp.TCPConnector(ssl=context_of(authority))
-    jar = aiohttp.CookieJar(unsafe=True)  # an address is as good as a name
+    jar = aiohttp.CookieJar(unsafe=True)  # an address works as well as a name
     async with aiohttp.ClientSession(headers={'Origin': origin}, connector=connector, cookie_jar=jar) as session:
         async with session.get(f'{origin}/') as answer:
             assert answer.status == 200
@@ -459,13 +459,13 @@ async def looks_at(server: LiveServer, token: str, authority: Path) -> None:
                 pass
         plain = {'Origin': origin.replace('https', 'http')}
         async with session.post(f'{origin}/api/session', json={'token': token}, headers=plain) as answer:
-            assert answer.status == 403  # a page that came over http is another one
+            assert answer.status == 403  # a page over http is a different origin
 
 
 def test_the_page_and_its_stream_come_over_https(
     tmp_path: Path, authorities: dict[str, Authority], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For whoever trusts the authority; the cookie never leaves the browser over http."""
+    """For clients that trust the CA; the browser never sends the cookie over http."""
 
     async def run() -> None:
         authority = authorities['authority']
@@ -481,7 +481,7 @@ def test_the_page_and_its_stream_come_over_https(
 def test_plain_http_gets_nothing_from_that_port(
     tmp_path: Path, authorities: dict[str, Authority], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither the page nor the form for a token, nor where they are."""
+    """Neither the page nor the token form, nor their address."""
 
     async def run() -> None:
         async with secured(tmp_path, authorities['authority'].sign('page'), monkeypatch) as server:
@@ -500,7 +500,7 @@ def test_plain_http_gets_nothing_from_that_port(
 def test_a_relay_sends_its_token_only_to_a_trusted_server(
     tmp_path: Path, authorities: dict[str, Authority], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The page of the store says that it is the certificate, and goes on."""
+    """The page of the store names the certificate as the reason, and continues."""
     tokens = make_tokens(tmp_path / 'live')
 
     async def run() -> None:
@@ -520,7 +520,7 @@ def test_a_relay_sends_its_token_only_to_a_trusted_server(
 
 
 def made_by_the_manual(folder: Path) -> tuple[Path, tuple[Path, Path]]:
-    """The authority, and certificate and key, of the commands in docs/tower.md, for this machine's address."""
+    """The CA, and certificate and key, from the commands in docs/tower.md, for this machine's address."""
     text = MANUAL.read_text(encoding='utf-8')
     lines = re.search(r'((?:    .*\n)+)', text[text.index('\n## TLS') :])
     assert lines
@@ -531,7 +531,7 @@ def made_by_the_manual(folder: Path) -> tuple[Path, tuple[Path, Path]]:
 
 @asynccontextmanager
 async def store_page(folder: Path, robot: LiveServer, token: Path, trusted: Path) -> AsyncIterator[Any]:
-    """``shadowhound-data live --robot-url https://...`` in a process of its own, with SSL_CERT_FILE; what has its port."""
+    """``shadowhound-data live --robot-url https://...`` in a separate process, with SSL_CERT_FILE; yields its port."""
     environ = {**os.environ, 'SHADOWHOUND_HOME': str(folder / 'tower_home'), 'SSL_CERT_FILE': str(trusted)}
     environ.pop('AWS_ENDPOINT_URL', None)
     process = await asyncio.create_subprocess_exec(
@@ -557,7 +557,7 @@ async def store_page(folder: Path, robot: LiveServer, token: Path, trusted: Path
 def test_a_store_page_relays_a_robot_that_it_trusts(
     tmp_path: Path, what: str, authorities: dict[str, Authority], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the authority that SSL_CERT_FILE names; else it says why there is no live view."""
+    """With the CA in SSL_CERT_FILE; otherwise it shows why there is no live view."""
     authority = authorities['authority']
     trusted = authority.path
     if what == 'by the manual':

@@ -1,4 +1,4 @@
-"""How topics are logged that no sensor names: by their types, under names that nothing else has."""
+"""Logging of topics without a configured sensor: by type, under unique names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shadowhound_data_logger.core.type_rules import RULES, is_of_unitree, sensor
 @pytest.mark.parametrize('type_name', RULES)
 @pytest.mark.parametrize('is_latched', [False, True])
 def test_every_rule_is_a_sensor_that_the_settings_would_accept(type_name: str, is_latched: bool) -> None:
-    """Its format, rate and batches go together."""
+    """Its format, rate and batches are consistent."""
     sensor = sensor_for('/a/b', type_name, (), is_latched=is_latched)
     assert sensor is not None
     default = default_parameters()
@@ -27,7 +27,7 @@ def test_every_rule_is_a_sensor_that_the_settings_would_accept(type_name: str, i
 
 
 def test_latched_topics_are_kept_when_they_change() -> None:
-    """Whatever their type, but pictures and clouds keep their rate."""
+    """For any type, except that images and clouds keep their rate."""
     latched = sensor_for('/robot_description', 'std_msgs/msg/String', (), is_latched=True)
     picture = sensor_for('/c', 'sensor_msgs/msg/Image', (), is_latched=True)
     assert latched is not None
@@ -58,7 +58,7 @@ def test_the_types_of_a_unitree_are_known() -> None:
 
 
 def test_listed_sensors_are_all_that_is_logged() -> None:
-    """Unless the settings ask for all topics."""
+    """Unless the settings select all topics."""
     assert Settings.load({}, {}).capture.topics == AUTO
     assert Settings.load({'sensors': ['imu']}, {}).capture.topics == NAMED
     assert Settings.load({'sensors': ['imu'], 'capture.topics': ALL}, {}).capture.topics == ALL

@@ -1,4 +1,4 @@
-"""Untrusted input: files of spreadsheets in any encoding, documents of any depth, and keys that lead out of a folder."""
+"""Untrusted input: spreadsheet files in any encoding, documents of any depth, and keys that escape a folder."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ ENCODINGS = {
 @pytest.mark.parametrize('reader', READERS)
 @pytest.mark.parametrize('end', ['\n', '\r\n'])
 def test_every_reader_takes_what_a_spreadsheet_saves(tmp_path: Path, reader: str, encoding: str, end: str) -> None:
-    """The values are those of the plain file, whatever the mark, the order of the bytes and the ends of the lines."""
+    """The values equal those of the plain file, for any BOM, byte order and line ends."""
     text, read, expected = READERS[reader]
     mark = '\ufeff' if encoding.endswith('order') else ''
     path = tmp_path / 'a.csv'
@@ -78,7 +78,7 @@ def test_every_reader_takes_what_a_spreadsheet_saves(tmp_path: Path, reader: str
 @pytest.mark.parametrize(('separator', 'name'), [(';', 'semicolons'), ('\t', 'tabs')])
 @pytest.mark.parametrize('reader', ['trajectory', '--times', '--clock', 'labels'])
 def test_other_separators_are_named(tmp_path: Path, reader: str, separator: str, name: str) -> None:
-    """Excel uses semicolons where the decimal mark is a comma, and tabs in "Unicode text": the error says what to do."""
+    """Excel uses semicolons if the decimal mark is a comma, and tabs in "Unicode text": the error has the remedy."""
     text, read, _ = READERS[reader]
     path = tmp_path / 'a.csv'
     path.write_text(text.replace(',', separator), encoding='utf-8-sig')
@@ -89,7 +89,7 @@ def test_other_separators_are_named(tmp_path: Path, reader: str, separator: str,
 @pytest.mark.parametrize('body', [b'\xff\xfe\x00', b'\xff\xff\xff', b'a,b\n"', b'\xef\xbb\xbf', b''])
 @pytest.mark.parametrize('reader', ['--times', '--clock', 'labels'])
 def test_files_that_are_not_text_are_refused_or_empty(tmp_path: Path, reader: str, body: bytes) -> None:
-    """Nothing but the reader's own error leaves it."""
+    """Only the reader's documented error is raised."""
     path = tmp_path / 'a.csv'
     path.write_bytes(body)
     found: Any = []
@@ -113,13 +113,13 @@ def objects(depth: int) -> bytes:
 @pytest.mark.parametrize('made', [lists, objects])
 @pytest.mark.parametrize('read', [from_json, lambda body: from_strict_json(body, 1 << 24)])
 def test_a_document_that_is_too_deep_is_refused(read: Callable[[bytes], Any], made: Callable[[int], bytes], depth: int) -> None:
-    """With a sentence, however deep it is: no reader goes into it by recursion then."""
+    """With a message, at any depth: no reader recurses into it."""
     with pytest.raises(ValueError, match='nested deeper than 64'):
         read(made(depth))
 
 
 def test_reasonably_nested_documents_are_read() -> None:
-    """A document with as much nesting as is allowed, and one that is wide."""
+    """A document with the maximum nesting, and a wide one."""
     for body in (
         lists(MAX_JSON_DEPTH),
         objects(MAX_JSON_DEPTH),
@@ -131,7 +131,7 @@ def test_reasonably_nested_documents_are_read() -> None:
 
 @pytest.mark.parametrize('depth', [500, 1000, 200_000])
 def test_samples_that_are_too_deep_are_no_samples(depth: int) -> None:
-    """Of a robot's batch, of its single documents, and beside the messages of an archive; the error is the one of bad content."""
+    """In a robot's batch, in single documents, and next to the messages of an archive; the error is that of invalid content."""
     sample = b'{"stamp_ns":1,"a":%b}' % objects(depth)
     for body in (sample, b'{"type":"x/msg/Y","samples":[%b]}' % sample):
         with pytest.raises(LakeError, match="not a sensor's JSON"):
@@ -142,7 +142,7 @@ def test_samples_that_are_too_deep_are_no_samples(depth: int) -> None:
 
 @pytest.mark.parametrize('depth', [500, 200_000])
 def test_deep_documents_are_refused_like_other_invalid_ones(depth: int) -> None:
-    """The digests of a data set, and a robot's mailbox."""
+    """The digests of a dataset, and a robot's mailbox."""
     for read in (_digests, decode_inbox):
         with pytest.raises((DataLoggerError, RequestRefused)):
             read(b'{"format":1,"entries":%b}' % lists(depth))
@@ -160,7 +160,7 @@ def tar_of(**files: bytes) -> bytes:
 
 @pytest.mark.parametrize('kind', [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE])
 def test_links_and_devices_in_an_archive_are_ignored(tmp_path: Path, kind: bytes) -> None:
-    """What an archive names beside its own bytes is not opened, wherever it points; its messages are read."""
+    """Nothing outside an archive is opened, whatever it refers to; its messages are read."""
     secret = tmp_path / 'secret.jpg'
     secret.write_bytes(b'the key')
     packed = BytesIO()
@@ -196,7 +196,7 @@ def test_a_path_is_below_its_folder(tmp_path: Path, key: str) -> None:
 @pytest.mark.parametrize('key', ['thor/../../../secret.jpg', 'thor/../../secret.jpg', 'thor//secret.jpg'])
 @pytest.mark.parametrize('is_fetched', [True, False])
 def test_a_dataset_reads_nothing_outside_its_folder(tmp_path: Path, key: str, is_fetched: bool) -> None:
-    """A row whose key leads to a file of this machine: of a store in a folder, and of a folder of fetched objects."""
+    """A row with a key that leads to a file of this machine: in a directory store, and in a folder of fetched objects."""
     (tmp_path / 'secret.jpg').write_bytes(b'secret')
     root = tmp_path / 'store' / catalog.BUCKET
     (root / 'thor').mkdir(parents=True)
@@ -210,7 +210,7 @@ def test_a_dataset_reads_nothing_outside_its_folder(tmp_path: Path, key: str, is
 
 
 def test_contents_are_read_from_no_other_folder(tmp_path: Path) -> None:
-    """A bucket is a name; a place reads no more than it is told that there is."""
+    """A bucket is a name; a reader opens only listed files."""
     (tmp_path / 'secret').write_bytes(b'secret')
     (tmp_path / 'store' / 'b').mkdir(parents=True)
     (tmp_path / 'store' / 'b' / 'k').write_bytes(b'content')
@@ -224,7 +224,7 @@ def test_contents_are_read_from_no_other_folder(tmp_path: Path) -> None:
 
 
 def test_a_source_reads_nothing_outside_its_bucket(tmp_path: Path) -> None:
-    """Neither of its objects' contents nor what is said beside them: a run's id is part of a key."""
+    """Neither contents nor files next to them: a run's id is part of a key."""
     settings = folder_store(tmp_path)
     outside = tmp_path / 'secret' / 'summary.json'
     outside.parent.mkdir()
@@ -246,7 +246,7 @@ def test_a_source_reads_nothing_outside_its_bucket(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('name', ['../evil.mcap', '/tmp/evil.mcap', 'a/../../evil.mcap', '..'])  # noqa: S108 - a name to be refused
 def test_a_bag_is_fetched_into_its_folder_alone(tmp_path: Path, name: str) -> None:
-    """Neither the name of a file nor that of the bag leads elsewhere; what was refused is not written."""
+    """Neither the name of a file nor that of the bag escapes it; refused files are not written."""
     store, to = MemoryStore(), tmp_path / 'to'
     body = tmp_path / 'body'
     body.write_bytes(b'evil')
@@ -260,7 +260,7 @@ def test_a_bag_is_fetched_into_its_folder_alone(tmp_path: Path, name: str) -> No
 
 
 def test_a_manifest_names_files_of_its_bag_alone(tmp_path: Path) -> None:
-    """Another file is never opened to be compared with what the manifest says of it."""
+    """No other file is opened to compare it with the manifest."""
     write_ours(tmp_path / NAME, slices=1)
     path = tmp_path / NAME / 'manifest.json'
     told = json.loads(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Supervised threads: a loop that fails is seen, counted and started again."""
+"""Supervised threads: a loop that fails is detected, counted and restarted."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_worker_repeats_until_it_is_stopped() -> None:
 
 
 def test_the_operating_system_has_the_name_of_a_thread() -> None:
-    """As ``top -H`` shows it, cut to what Linux takes."""
+    """As ``top -H`` shows it, truncated to Linux's maximum."""
     names: list[str] = []
     worker = Worker('a-thread-with-a-long-name', lambda: names.append(worker_module.SYSTEM_NAME.read_text(encoding='utf-8')))
     worker.start()
@@ -52,7 +52,7 @@ def test_the_operating_system_has_the_name_of_a_thread() -> None:
 
 
 def test_a_worker_runs_where_threads_cannot_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is no failure."""
+    """That is not an error."""
     monkeypatch.setattr(worker_module, 'SYSTEM_NAME', tmp_path / 'none' / 'comm')
     rounds = threading.Semaphore(0)
     worker = Worker('rounds', rounds.release)
@@ -64,7 +64,7 @@ def test_a_worker_runs_where_threads_cannot_be_named(tmp_path: Path, monkeypatch
 
 
 def test_a_failure_is_counted_and_logged(caplog: pytest.LogCaptureFixture) -> None:
-    """A round that raises shows in the log and in the status, and the next one begins after a pause."""
+    """An exception in a round is in the log and in the status, and the next one starts after a pause."""
     caplog.set_level(logging.INFO)
     rounds: list[int] = []
     well = threading.Event()
@@ -73,7 +73,7 @@ def test_a_failure_is_counted_and_logged(caplog: pytest.LogCaptureFixture) -> No
         rounds.append(len(rounds))
         if len(rounds) <= 2:
             raise ZeroDivisionError('by nothing')
-        if len(rounds) > 3:  # the third round is over, and judged
+        if len(rounds) > 3:  # the third round has ended, and is evaluated
             well.set()
 
     worker = Worker('faulty', step)
@@ -88,7 +88,7 @@ def test_a_failure_is_counted_and_logged(caplog: pytest.LogCaptureFixture) -> No
 
 
 def test_a_stop_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A worker that waits after a failure stops at once."""
+    """A worker that waits after a failure stops immediately."""
     monkeypatch.setattr(worker_module, 'FIRST_PAUSE_S', 60.0)
     failed = threading.Event()
 
@@ -105,7 +105,7 @@ def test_a_stop_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_hanging_round_is_reported() -> None:
-    """Join says that it did not end in time; one that never started has nothing to wait for."""
+    """Join reports that it did not end before the deadline; for one that never started it returns immediately."""
     began, released = threading.Event(), threading.Event()
 
     def step() -> None:
@@ -124,7 +124,7 @@ def test_a_hanging_round_is_reported() -> None:
 
 @pytest.mark.parametrize('death', [SystemExit(1), KeyboardInterrupt(), GeneratorExit(), MemoryError('no room')])
 def test_no_exception_ends_the_thread(death: BaseException) -> None:
-    """Not even what is meant to end a program: it is counted as any failure, and the next round comes."""
+    """Not even one that should end a program: it is counted as any failure, and the next round starts."""
     deaths, well = [death], threading.Event()
 
     def step() -> None:
@@ -142,7 +142,7 @@ def test_no_exception_ends_the_thread(death: BaseException) -> None:
 
 
 def test_a_thread_that_ends_is_started_again(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """One that dies of its own bookkeeping is found dead, counted once, said, and begun anew after its pause."""
+    """One that crashes in its bookkeeping is detected, counted once, reported, and restarted after its pause."""
     deaths = [ZeroDivisionError('in a round')]
     well = threading.Event()
     worker = Worker('mortal', lambda: _raise(deaths.pop()) if deaths else well.set())
@@ -171,7 +171,7 @@ def test_a_thread_that_ends_is_started_again(monkeypatch: pytest.MonkeyPatch, ca
 
 
 def test_a_thread_that_cannot_be_started_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the start, or later: that is a death like any other, and over when there is one again."""
+    """At startup, or later: that is a crash like any other, and ends once a thread starts."""
     well = threading.Event()
     worker = Worker('starved', well.set)
     with monkeypatch.context() as patch:
@@ -198,7 +198,7 @@ def test_checking_a_stopped_worker_starts_nothing() -> None:
 
 
 def test_the_duration_of_a_round_is_reported() -> None:
-    """A round that hangs grows old in the status; one that ends does not."""
+    """The duration of a hung round grows in the status; that of a finished one does not."""
     released = threading.Event()
 
     def step() -> None:
@@ -215,7 +215,7 @@ def test_the_duration_of_a_round_is_reported() -> None:
 
 
 def test_workers_share_reported_failures(caplog: pytest.LogCaptureFixture) -> None:
-    """A defect that many of them meet, again and again, is one entry in the log, with its traceback."""
+    """A defect that many of them meet repeatedly is one entry in the log, with its traceback."""
     reported: set[str] = set()
     workers = [Worker(f'w-{number}', lambda: _raise(ValueError('x')), reported=reported) for number in range(3)]
     for worker in workers:
@@ -233,13 +233,13 @@ def _raise(error: BaseException) -> None:
 
 
 def test_a_worker_that_keeps_failing_is_tried_less_often() -> None:
-    """The pause doubles up to its own longest one."""
+    """The pause doubles up to the worker's maximum."""
     worker = Worker('rare', lambda: None, longest_pause_s=0.003)
     assert [worker._next_pause() for _ in range(4)] == [0.001, 0.002, 0.003, 0.003]
 
 
 def test_a_starting_worker_is_not_reported_as_dead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is started by another thread than the one that supervises it."""
+    """Its starting thread is not the one that supervises it."""
     start = threading.Thread.start
     worker = Worker('worker', lambda: time.sleep(0.01))
 

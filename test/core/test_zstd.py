@@ -28,6 +28,6 @@ print(unpacked('zstd', zstd.compress(b'a chunk')))
 
 @pytest.mark.long('a process of its own')
 def test_from_python_3_14_on_only_the_standard_library_is_needed() -> None:
-    """Every module of mcap and bags is imported by an interpreter that says it is 3.14, without the package of before."""
+    """Every module of mcap and bags is imported by an interpreter that reports 3.14, without `backports.zstd`."""
     ran = subprocess.run([sys.executable, '-c', PROGRAM], capture_output=True, text=True, check=False, timeout=120)
     assert (ran.returncode, ran.stdout) == (0, "b'a chunk'\n"), ran.stderr

@@ -23,7 +23,7 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
 
 @pytest.fixture(scope='module')
 def servers(tower: Tower) -> Tower:
-    """A Tower as it should be: the guide's buckets, a key pair of the least rights for Thor, one that reads for Spark."""
+    """A correct Tower: the guide's buckets, a key pair with minimal permissions for Thor, one that reads for Spark."""
     client = S3Client(tower.store_settings(), UploadSettings())
     client.open()
     for bucket in BUCKETS:
@@ -34,7 +34,7 @@ def servers(tower: Tower) -> Tower:
 
 @pytest.fixture
 def with_tower(scene: Scene, servers: Tower) -> Scene:
-    """With Thor's keys. Others load the machine: how fast it is now is not what is asked here."""
+    """With Thor's keys. Other tests load the machine: its speed is not checked here."""
     patch = scene.stack.enter_context(pytest.MonkeyPatch.context())
     patch.setattr(s3_put, 'SLOW_MBPS', 0.0)
     patch.setattr(s3, 'SLOW_S', 60.0)

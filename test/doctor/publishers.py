@@ -1,4 +1,4 @@
-"""Program of a test: several robots in one domain, each in its namespace, each but the first with one thing wrong."""
+"""Program of a test: several robots in one domain, each in its namespace, each except the first with one fault."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sensor_msgs.msg import Image, LaserScan, PointCloud2
 
 RATE_HZ = 20.0
 SLOW_EVERY = 20
-"""One in so many."""
+"""One in this many."""
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def main() -> None:
-    """For ever."""
+    """Publish in an endless loop."""
     rclpy.init()
     node = Node('robots', start_parameter_services=False, enable_rosout=False)
     steady = []
@@ -41,7 +41,7 @@ def main() -> None:
         node.create_publisher(Image, '/other/front/image', RELIABLE),
         node.create_publisher(Twist, '/other/cmd_vel', RELIABLE),
     ]
-    context = rclpy.Context()  # one participant has one type for a topic
+    context = rclpy.Context()  # a participant has one type per topic
     rclpy.init(context=context)
     another = Node('another', context=context, start_parameter_services=False, enable_rosout=False)
     another.create_publisher(PoseStamped, '/two/odom', RELIABLE)
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def end() -> None:
-    """With whoever started it."""
+    """Exit along with the parent."""
     sys.stdin.read()
     os._exit(0)
 

@@ -1,4 +1,4 @@
-"""A machine to examine: its variables, its folders, and a separate /proc where that matters."""
+"""A machine to examine: its variables, its folders, and a separate /proc if needed."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ FOREIGN = (
     'no_proxy',
 )
 PATIENCE_S = 120.0
-"""Of an examination: other tests load the machine, and these are about what is found."""
+"""Deadline of an examination: other tests load the machine, and these are about the findings."""
 BIG_BUFFER = 16 << 20
 
 
 @dataclass
 class Scene:
-    """A healthy robot until something is done to it. What is put on ``stack`` is undone in the end."""
+    """A healthy robot until a test changes it. Changes on ``stack`` are undone at the end."""
 
     folder: Path
     stack: ExitStack
@@ -56,7 +56,7 @@ class Scene:
 
     @classmethod
     def healthy(cls, folder: Path, stack: ExitStack) -> Scene:
-        """Without a Tower; its kernel is generous, and nothing else runs."""
+        """Without a Tower; its kernel has large buffers, and no other process runs."""
         scene = cls(folder, stack, root=folder / 'root')
         kept = {name: value for name, value in os.environ.items() if not name.startswith(FOREIGN)}
         scene.environ = {**kept, 'HOME': str(folder / 'user'), 'SHADOWHOUND_HOME': str(folder / 'home')}
@@ -87,17 +87,17 @@ class Scene:
     def findings(self, *names: str) -> list[Result]:
         return [result for result in self.ask(*names) if result.is_finding]
 
-    # -- what stands on the machine ----------------------------------------------------------------------------------
+    # -- the state of the machine ------------------------------------------------------------------------------------
 
     def open_spool(self) -> Spool:
-        """As the node's; closed in the end."""
+        """The node's spool; closed at the end."""
         spool = Spool(self.spool, SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), 'thor')
         spool.open()
         self.stack.callback(spool.close)
         return spool
 
     def run_node(self, **changes: Any) -> None:
-        """A status as a node writes it, of this moment and this process."""
+        """A status as a node writes it, from now and this process."""
         clock = SystemClock.of_this_machine()
         status = {
             'robot': 'thor', 'version': '', 'pid': os.getpid(), 'boot_id': clock.boot_id, 'boot_ns': clock.boot_ns(),
@@ -107,7 +107,7 @@ class Scene:
         file(self.spool, 'thor').write_text(json.dumps(status))
 
     def process(self, pid: int, *words: str, **environ: str) -> None:
-        """One more in /proc."""
+        """Add a process to /proc."""
         folder = self.root / f'proc/{pid}'
         folder.mkdir()
         (folder / 'cmdline').write_bytes(b'\0'.join(word.encode() for word in (*words, '')))
@@ -120,7 +120,7 @@ class Scene:
 
 
 def expect(found: list[Result], name: str, *words: str) -> None:
-    """The one finding, by its name, with a remedy that has these words."""
+    """The only finding, by its name, with a remedy that contains this text."""
     told = [f'{result.check}: {result.seen} | {result.cause} -> {result.remedy}' for result in found]
     assert [result.check for result in found] == [name], told or 'nothing was found'
     assert found[0].seen, told
@@ -139,7 +139,7 @@ Inject = Callable[[Scene], None]
 
 @contextmanager
 def patient(seconds: float) -> Iterator[None]:
-    """How long an answer may take."""
+    """The timeout of a response."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(s3, 'ANSWER_S', seconds)
         patch.setattr(mlflow_rest, 'TIMEOUT_S', seconds)

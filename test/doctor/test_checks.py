@@ -1,4 +1,4 @@
-"""Faults of the robot's own machine, one at a time: its shell, its secrets, its kernel, its disk and its spool."""
+"""Faults of the robot's machine, one at a time: its shell, its secrets, its kernel, its disk and its spool."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ASKED = ('versions', 'environment', 'secrets', 'network.s3', 'ros.environment', 
 
 @pytest.fixture
 def robot(scene: Scene) -> Scene:
-    """Everything is well: a node runs over a spool with one delivered object, and Tower's address is set."""
+    """A healthy robot: a node with a spool with one delivered object, and the Tower's address is set."""
     scene.environ |= {'AWS_ENDPOINT_URL': 'http://127.0.0.1:1', 'AWS_ACCESS_KEY_ID': 'a', 'AWS_SECRET_ACCESS_KEY': 'b',
                       'MLFLOW_TRACKING_URI': 'http://127.0.0.1:1'}  # fmt: skip
     spool = scene.open_spool()
@@ -46,7 +46,7 @@ def robot(scene: Scene) -> Scene:
 
 
 def wrong(name: str, value: str, **more: str) -> Inject:
-    """A variable of the shell, and others that decide what is wrong with it."""
+    """A variable of the shell, and others that determine the fault."""
     return lambda scene: scene.environ.update({name: value, **more})
 
 
@@ -74,13 +74,13 @@ def small_buffers(scene: Scene) -> None:
 
 
 def small_buffers_of_fast_dds(scene: Scene) -> None:
-    """The robot speaks Cyclone DDS, and is told nothing of it; the node would listen through Fast DDS."""
+    """The robot uses Cyclone DDS, with its defaults; the node would subscribe through Fast DDS."""
     scene.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
     (scene.root / 'proc/sys/net/core/rmem_max').write_text('212992\n')
 
 
 def small_buffers_of_the_node(scene: Scene) -> None:
-    """The kernel would give more by now."""
+    """The kernel would allow more by now."""
     scene.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
     scene.run_node(middleware=beside(receive_bytes=212_992, dropped_datagrams=17))
 
@@ -105,7 +105,7 @@ def driver_with_small_memory(**environ: str) -> Inject:
 
 
 def backlog(scene: Scene) -> None:
-    """An object of an hour ago, which nobody took."""
+    """A pending object from an hour ago."""
     put(scene.open_spool(), make('thor/late.jpg'))
     with sqlite3.connect(scene.spool / 'index.db') as index:
         index.execute('UPDATE objects SET created_ns = ?', (time.time_ns() - 3600 * SECOND,))
@@ -124,8 +124,8 @@ def unbalanced(scene: Scene) -> None:
 
 
 def damaged(scene: Scene) -> None:
-    """Pages of the index that a bad disk gave back."""
-    scene.stack.close()  # the spool is closed, so that all is in the file
+    """Pages of the index that a bad disk corrupted."""
+    scene.stack.close()  # the spool is closed, so that everything is in the file
     path = scene.spool / 'index.db'
     body = bytearray(path.read_bytes())
     body[4096:-4096] = os.urandom(len(body) - 8192)
@@ -133,7 +133,7 @@ def damaged(scene: Scene) -> None:
 
 
 def locked(scene: Scene) -> None:
-    """By a process that is not a node."""
+    """Locked by a process that is not a node."""
     path = scene.spool / 'drain.lock'
     path.touch()
     program = 'import fcntl, sys; f = open(sys.argv[1]); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); sys.stdin.read()'
@@ -170,14 +170,14 @@ def deaf_tower(scene: Scene) -> None:
 
 
 def unfinished_port(scene: Scene) -> None:
-    """What a process has left that was killed while it made a port."""
+    """A port left by a process that was killed while it created it."""
     port = scene.root / 'dev/shm/fastdds_port7411'
     port.touch()
     os.utime(port, (0, 0))
 
 
 def left_segment(scene: Scene) -> None:
-    """With its lock, which nobody holds."""
+    """With its lock, which no process holds."""
     segment = scene.root / 'dev/shm/fastrtps_0123456789abcdef'
     segment.write_bytes(bytes(2_000_000))
     lock = segment.with_name(f'{segment.name}_el')
@@ -186,7 +186,7 @@ def left_segment(scene: Scene) -> None:
 
 
 def patched(target: str, value: object) -> Inject:
-    """Something of the doctor's own modules is another for the time of the test."""
+    """Replace something in the doctor's modules during the test."""
 
     def inject(scene: Scene) -> None:
         scene.stack.enter_context(pytest.MonkeyPatch.context()).setattr(f'shadowhound_data_logger.doctor.{target}', value)
@@ -206,7 +206,7 @@ def stuck_mission(_: Path) -> list[MissionBrief]:
 
 
 def beside(**middleware: object) -> dict[str, object]:
-    """The middleware of a node that listens through Fast DDS beside a robot with Cyclone DDS."""
+    """The middleware of a node that uses Fast DDS on a robot with Cyclone DDS."""
     return {'rmw': 'rmw_fastrtps_cpp', 'robot': 'rmw_cyclonedds_cpp', **middleware}
 
 
@@ -301,16 +301,16 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
 
 @pytest.mark.parametrize(('inject', 'asked', 'name', 'words'), FAULTS.values(), ids=FAULTS)
 def test_a_fault_is_found_and_named(robot: Scene, inject: Inject, asked: str, name: str, words: tuple[str, ...]) -> None:
-    """By one finding alone, whose remedy is the right one."""
+    """By exactly one finding, with the correct remedy."""
     inject(robot)
     found = robot.findings(asked)
     if name == 'tower.listen':
-        found = found[:1]  # both addresses are of one port here
+        found = found[:1]  # both addresses use the same port here
     expect(found, name, *words)
 
 
 def test_shared_memory_of_killed_processes_is_freed(robot: Scene) -> None:
-    """By ``--fix``, which says how much."""
+    """By ``--fix``, which reports the amount."""
     left_segment(robot)
     done = [what for _, what in fix(robot.findings('sockets'), robot.context())]
     assert done == [f'freed 2 MB in {robot.root / "dev/shm"}']
@@ -319,7 +319,7 @@ def test_shared_memory_of_killed_processes_is_freed(robot: Scene) -> None:
 
 
 def test_a_robot_with_cyclone_dds_is_checked_through_the_nodes_rmw(robot: Scene) -> None:
-    """Through Fast DDS, whose buffer is as large as the kernel gives, whatever Cyclone DDS would ask for itself."""
+    """Through Fast DDS, with the maximum buffer of the kernel, whatever Cyclone DDS would request."""
     robot.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
     assert robot.findings('sockets') == []
     (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
@@ -338,7 +338,7 @@ def test_a_robot_with_cyclone_dds_is_checked_through_the_nodes_rmw(robot: Scene)
      ('foxy', ['tested are humble, jazzy, kilted'])],
 )  # fmt: skip
 def test_an_untested_distribution_is_reported(robot: Scene, distro: str, told: list[str]) -> None:
-    """As no finding, and Lyrical otherwise than one that nobody thought of."""
+    """Not as a finding, and for Lyrical differently than for an unknown one."""
     robot.environ['ROS_DISTRO'] = distro
     results = robot.ask('versions')
     assert [result.cause for result in results if result.check == 'versions.ros'] == told
@@ -346,7 +346,7 @@ def test_an_untested_distribution_is_reported(robot: Scene, distro: str, told: l
 
 
 def test_a_parameter_file_for_another_node_is_a_finding(robot: Scene, tmp_path: Path) -> None:
-    """A misspelt section is not an error to ROS: the node runs with its defaults, and only here somebody says so."""
+    """A misspelled section is not an error to ROS: the node runs with its defaults, and only this check reports it."""
     path = tmp_path / 'mine.yaml'
     path.write_text('sensor_loger_node:\n  ros__parameters: {camera: {rate_hz: 2.0}}\n')
     context = make_context(robot.environ, role=robot.role, parameter_file=path, root=robot.root)
@@ -354,14 +354,14 @@ def test_a_parameter_file_for_another_node_is_a_finding(robot: Scene, tmp_path: 
 
 
 def test_every_check_is_on_the_page() -> None:
-    """docs/doctor.md has a line that says what it asks and what it finds."""
+    """docs/doctor.md has a line with what it checks and what it finds."""
     page = (Path(__file__).parents[2] / 'docs' / 'doctor.md').read_text(encoding='utf-8')
     lines = ' '.join(re.findall(r'^- (`.*?) \(', page.partition('## The checks')[2], re.MULTILINE))
     assert [check.name for check in CHECKS if f'`{check.name}`' not in lines] == []
 
 
 def test_a_healthy_robot_gives_no_finding(robot: Scene) -> None:
-    """Of all that is asked without a network."""
+    """In all checks that need no network."""
     asked = [name for name in ASKED if not name.startswith('network')]
     results = robot.ask(*asked)
     assert but_speed(results) == []
@@ -369,12 +369,12 @@ def test_a_healthy_robot_gives_no_finding(robot: Scene) -> None:
 
 
 def but_speed(results: list[Result]) -> list[Result]:
-    """The findings; how fast the disk under the tests is now is not theirs to judge."""
+    """The findings except the speed of the test's disk."""
     return [result for result in results if result.is_finding and result.check not in {'disk.speed', 'disk.sync'}]
 
 
 def test_the_default_domain_is_that_of_a_shell_without_one(robot: Scene) -> None:
-    """A node that was told domain 0 is where a shell is that was told none."""
+    """A node with domain 0 is in the same domain as a shell without one."""
     robot.process(os.getpid(), 'sensor_logger_node', **{**robot.environ, 'ROS_DOMAIN_ID': '0'})
     assert robot.findings('environment') == []
 
@@ -385,7 +385,7 @@ def test_the_default_domain_is_that_of_a_shell_without_one(robot: Scene) -> None
     ('MLFLOW_S3_ENDPOINT_URL', 'http://me:hunter2@tower:9000'), ('AWS_ENDPOINT_URL', 'http://me:hunter2@127.0.0.1:1'),
 ])  # fmt: skip
 def test_no_password_is_shown(robot: Scene, name: str, url: str) -> None:
-    """That of a URL: not of a database, and not of one that is mistyped."""
+    """The password of a URL: neither a database's nor a mistyped one's."""
     robot.environ[name] = url
     told = json.dumps(
         [result.as_dict() for result in robot.ask('environment', 'secrets', 'network.s3', 'network.mlflow', 'mlflow')]
@@ -396,7 +396,7 @@ def test_no_password_is_shown(robot: Scene, name: str, url: str) -> None:
 
 
 def test_a_slow_disk_is_named_within_its_deadline(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An SD card that takes a second for a sync and another for each megabyte: found, and not given up on."""
+    """An SD card that takes a second for a sync and another for each megabyte: found before the timeout."""
     now_s, waiting = [0.0], [0]
 
     def sync(number: int) -> None:
@@ -413,7 +413,7 @@ def test_a_slow_disk_is_named_within_its_deadline(robot: Scene, monkeypatch: pyt
 
 @pytest.fixture
 def small_disk(scene: Scene) -> Path:
-    """A file system of its own under the home."""
+    """A separate file system under the home."""
     scene.home.mkdir()
     command = ['mount', '-t', 'tmpfs', '-o', f'size={16 * MEBI}', 'none', str(scene.home)]
     if subprocess.run(command, capture_output=True, check=False).returncode:
@@ -424,7 +424,7 @@ def small_disk(scene: Scene) -> Path:
 
 @pytest.mark.long('a disk of its own')
 def test_a_full_disk_is_a_finding(scene: Scene, small_disk: Path) -> None:
-    """It is said before the node has to evict, and when nothing at all is free."""
+    """It is reported before the node must evict, and when no space is free at all."""
     scene.parameters['spool.min_free_bytes'] = 4 * MEBI
     assert but_speed(scene.ask('disk')) == []
     with (small_disk / 'filler').open('wb', buffering=0) as file:

@@ -1,4 +1,4 @@
-"""The context: which machine this is taken for, and settings as far as they can be read."""
+"""The context: the detected role of this machine, and the readable settings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def guessed(scene: Scene) -> Role:
 
 
 def test_ros_and_a_spool_make_the_role_robot(scene: Scene) -> None:
-    """Also where somebody tries a Tower of his own on the robot."""
+    """Also if a Tower is tried out on the robot."""
     scene.environ['ROS_DISTRO'] = 'humble'
     scene.spool.mkdir(parents=True)
     (scene.spool / 'index.db').touch()
@@ -33,7 +33,7 @@ def test_ros_and_a_spool_make_the_role_robot(scene: Scene) -> None:
 
 
 def test_servers_make_the_role_tower(scene: Scene, tmp_path: Path) -> None:
-    """One that listens on a port of the guide or of the variables, or what the compose file is started with."""
+    """One that listens on a port of the guide or of the variables, or the files for starting it."""
     scene.listen('00000000:2328')
     assert guessed(scene) is Role.SERVER
     scene.listen('00000000:2329')
@@ -47,7 +47,7 @@ def test_servers_make_the_role_tower(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_the_role_otherwise_depends_on_ros(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A robot on its first day, and somebody's desk."""
+    """A new robot, and a developer's desktop."""
     scene.environ['ROS_DISTRO'] = 'humble'
     assert guessed(scene) is Role.ROBOT
     del scene.environ['ROS_DISTRO']
@@ -56,7 +56,7 @@ def test_the_role_otherwise_depends_on_ros(scene: Scene, monkeypatch: pytest.Mon
 
 
 def test_invalid_settings_are_reported_and_dropped(scene: Scene) -> None:
-    """One after the other, until the rest is taken."""
+    """One after the other, until the rest is accepted."""
     scene.environ |= {'AWS_ENDPOINT_URL': 'tower:9000', 'SHADOWHOUND_ROBOT': '../thor'}
     scene.parameters = {'camera.rate': 1.0, 'imu.batch_s': -1.0, 'odom.rate_hz': 2.0}
     made = scene.context()
@@ -67,7 +67,7 @@ def test_invalid_settings_are_reported_and_dropped(scene: Scene) -> None:
 
 
 def test_contradicting_sensors_fall_back_to_the_defaults(scene: Scene) -> None:
-    """Where it is not a single parameter that is wrong, the defaults are taken: it ends."""
+    """If no single parameter is wrong, the defaults are used: it terminates."""
     scene.parameters = {'sensors': ['imu', 'imu'], 'imu.topics': ['a']}
     scene.environ['SHADOWHOUND_ROBOT'] = 'tachi'
     assert scene.context().refused[0].data['name'] == 'sensors'
@@ -76,7 +76,7 @@ def test_contradicting_sensors_fall_back_to_the_defaults(scene: Scene) -> None:
 
 
 def test_a_parameter_file_is_read_like_the_nodes(tmp_path: Path) -> None:
-    """Those of our node and of all nodes, flat; other nodes' are not ours."""
+    """Those of our node and of all nodes, flat; other nodes' are ignored."""
     path = tmp_path / 'a.yaml'
     path.write_text('/**:\n  ros__parameters: {robot: tachi}\nsensor_logger_node:\n  ros__parameters:\n    imu: {batch_s: 2.0}\n'
                     'other:\n  ros__parameters: {x: 1}\n')  # fmt: skip
@@ -91,7 +91,7 @@ def test_a_parameter_file_is_read_like_the_nodes(tmp_path: Path) -> None:
 
 
 def test_a_parameter_file_of_two_robots_is_read_by_namespace(tmp_path: Path) -> None:
-    """Of each namespace its own."""
+    """Each namespace has its parameters."""
     path = tmp_path / 'fleet.yaml'
     path.write_text(
         '/tachi/sensor_logger_node:\n  ros__parameters: {robot: tachi, imu.rate_hz: 10.0}\n'
@@ -104,7 +104,7 @@ def test_a_parameter_file_of_two_robots_is_read_by_namespace(tmp_path: Path) -> 
 
 
 def test_listening_addresses_are_classified(scene: Scene) -> None:
-    """IPv4 and IPv6, as the kernel writes them; what is connected does not listen."""
+    """IPv4 and IPv6, as the kernel writes them; connected sockets do not listen."""
     scene.listen('0100007F:1389', '00000000:2328', '0A01A8C0:0050')
     six = (
         '00000000000000000000000001000000:1F90',
@@ -119,7 +119,7 @@ def test_listening_addresses_are_classified(scene: Scene) -> None:
 
 
 def test_domains_in_use_are_found(scene: Scene) -> None:
-    """By the port on which everybody of a domain listens, or the first one who does without multicast; each domain once."""
+    """By the multicast port of a domain, or the port of the first participant without multicast; each domain once."""
     (scene.root / 'proc/net/udp').write_text(
         'head\n 1: 00000000:1CE8 0:0 07\n 2: 00000000:21CA 0:0 07\n 3: 00000000:1CF2 0:0 07\n 4: 0100007F:23C8 0:0 07\n'
     )

@@ -1,4 +1,4 @@
-"""What the doctor finds at an MLflow server, with the one of a Tower."""
+"""Findings about an MLflow server, with that of a Tower."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def rest(tower: Tower, path: str, **body: Any) -> Any:
 
 
 class _Open(BaseHTTPRequestHandler):
-    """As far as an MLflow server without users is asked before anything is written."""
+    """An MLflow server without users, up to the first write."""
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -50,7 +50,7 @@ class _Open(BaseHTTPRequestHandler):
 
 
 def test_an_mlflow_without_authentication_is_named(with_tower: Scene) -> None:
-    """An open server is named, with what that means."""
+    """An open server is named, with the consequences."""
     server = ThreadingHTTPServer(('127.0.0.1', 0), _Open)
     serving = threading.Thread(target=server.serve_forever)
     serving.start()
@@ -64,7 +64,7 @@ def test_an_mlflow_without_authentication_is_named(with_tower: Scene) -> None:
 
 
 def test_the_login_of_mlflows_own_file_is_used(with_tower: Scene, servers: Tower) -> None:
-    """~/.mlflow/credentials counts where the environment has none, as for MLflow's clients; half a login is found."""
+    """~/.mlflow/credentials counts if the environment has none, as for MLflow's clients; an incomplete login is found."""
     user, password = (with_tower.environ.pop(name) for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'))
     file = Path(with_tower.environ['HOME']) / '.mlflow/credentials'
     file.parent.mkdir()
@@ -76,7 +76,7 @@ def test_the_login_of_mlflows_own_file_is_used(with_tower: Scene, servers: Tower
 
 
 def test_artifacts_that_do_not_reach_their_store_are_a_finding(with_tower: Scene, servers: Tower) -> None:
-    """MLflow answers and takes experiments; only the artifact itself shows it."""
+    """MLflow responds and accepts experiments; only the artifact itself shows it."""
     artifacts = servers._folder / 'mlflow/artifacts'
     away = artifacts.with_name('away')
     if artifacts.exists():
@@ -91,10 +91,10 @@ def test_artifacts_that_do_not_reach_their_store_are_a_finding(with_tower: Scene
 
 
 def test_artifacts_that_stay_on_the_robot_are_a_finding(with_tower: Scene, servers: Tower, tmp_path: Path) -> None:
-    """The guide's last story: the run succeeds, and its artifacts are in no store."""
+    """The guide's last problem: the run succeeds, and its artifacts are not in any store."""
     experiment = rest(servers, 'experiments/search', filter="name = 'thor_missions'", max_results=1)['experiments'][0]
     number = experiment['experiment_id']
-    with closing(sqlite3.connect(servers._folder / 'mlflow/mlflow.db')) as database:  # as a server of before made it
+    with closing(sqlite3.connect(servers._folder / 'mlflow/mlflow.db')) as database:  # as an older server created it
         move = 'update experiments set artifact_location = ? where experiment_id = ?'
         with database:
             database.execute(move, (f'file://{tmp_path}', number))
@@ -111,7 +111,7 @@ def test_artifacts_that_stay_on_the_robot_are_a_finding(with_tower: Scene, serve
 
 
 def test_artifacts_that_are_sent_to_s3_directly_need_credentials(with_tower: Scene, servers: Tower) -> None:
-    """Then the robot's own keys and MLFLOW_S3_ENDPOINT_URL decide."""
+    """Then the robot's keys and MLFLOW_S3_ENDPOINT_URL are used."""
     expect(_direct(with_tower, 's3://mlflow/9'), 'mlflow.artifacts', 's3:PutObject', 'mlflow')
     with_tower.environ |= servers.environment('tower')
     assert [result.severity for result in _direct(with_tower, 's3://mlflow/9')] == [Severity.OK]

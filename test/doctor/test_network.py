@@ -1,4 +1,4 @@
-"""Faults between a robot and its Tower, one at a time, with real servers wherever the fault is one of a server."""
+"""Faults between a robot and its Tower, one at a time, with real servers for faults of a server."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SERVICES = ('s3', 'mlflow', 'seaweedfs')
 
 
 def test_a_healthy_tower_gives_no_finding(with_tower: Scene, servers: Tower) -> None:
-    """Not with the robot's few rights, not for Tower's own keys, and not for one who reads."""
+    """With the robot's limited permissions, with Tower's keys, and with read-only keys."""
     for role in (Role.ROBOT, Role.ROBOT, Role.SERVER, Role.WORKSTATION):
         with_tower.role = role
         user = {Role.SERVER: 'tower', Role.WORKSTATION: 'spark'}.get(role, 'thor')
@@ -39,7 +39,7 @@ def test_a_healthy_tower_gives_no_finding(with_tower: Scene, servers: Tower) -> 
 
 
 def test_ports_of_other_programs_are_not_a_finding(with_tower: Scene) -> None:
-    """One that hangs, one that speaks plain HTTP and none at all: a robot waits for none of them."""
+    """One that hangs, one with plain HTTP and one that is closed: a robot waits for none of them."""
     began = time.monotonic()
     with hung() as mute, served(FakeS3()) as other, refused() as nothing:
         for url in (mute, other.url, nothing):
@@ -49,7 +49,7 @@ def test_ports_of_other_programs_are_not_a_finding(with_tower: Scene) -> None:
 
 
 def fronted(fault: Fault = Fault.NONE, condition: Condition = Condition.HONOURED) -> Inject:
-    """The real server behind a front that does this to every request."""
+    """The real server behind a proxy that does this to every request."""
 
     def inject(scene: Scene) -> None:
         front = Front(scene.environ['AWS_ENDPOINT_URL'], lambda: fault, secret=scene.environ['AWS_SECRET_ACCESS_KEY'],
@@ -60,7 +60,7 @@ def fronted(fault: Fault = Fault.NONE, condition: Condition = Condition.HONOURED
 
 
 def imitated(**faults: Any) -> Inject:
-    """A server that is none: it verifies no checksum, signature or whatever."""
+    """A fake server: it verifies no checksum, signature or anything else."""
 
     def inject(scene: Scene) -> None:
         scene.environ['AWS_ENDPOINT_URL'] = scene.stack.enter_context(served(FakeS3(**faults))).url
@@ -102,7 +102,7 @@ FAULTS: dict[str, tuple[Inject, str, tuple[str, ...]]] = {
 
 @pytest.mark.parametrize(('inject', 'name', 'words'), FAULTS.values(), ids=FAULTS)
 def test_a_fault_is_found_and_named(with_tower: Scene, inject: Inject, name: str, words: tuple[str, ...]) -> None:
-    """Once, with the right remedy, and without a sequel of other findings."""
+    """Once, with the correct remedy, and without other findings."""
     inject(with_tower)
     service = 'mlflow' if 'mlflow' in name else 's3'
     found = with_tower.findings(f'network.{service}', service)
@@ -114,7 +114,7 @@ def test_a_fault_is_found_and_named(with_tower: Scene, inject: Inject, name: str
 
 
 def test_swapped_ports_are_named(with_tower: Scene) -> None:
-    """The S3 server's and MLflow's: both are found."""
+    """Those of the S3 server and MLflow: both are found."""
     swapped(with_tower)
     found = {result.check: result for result in with_tower.findings(*NETWORK, *SERVICES)}
     assert set(found) == {'s3.answer', 'mlflow.answer'}
@@ -122,14 +122,14 @@ def test_swapped_ports_are_named(with_tower: Scene) -> None:
 
 
 def test_the_usual_port_is_proposed(with_tower: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nothing listens on the port that is set, and something on the usual one."""
+    """If nothing listens on the configured port, and a server on the usual one."""
     nobody_there('AWS_ENDPOINT_URL')(with_tower)
     monkeypatch.setattr(network, '_answers', lambda _, port: port == 9000)
     expect(with_tower.findings('network.s3'), 'network.s3.tcp', 'export AWS_ENDPOINT_URL=http://127.0.0.1:9000')
 
 
 def test_every_address_of_a_name_is_tried(with_tower: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The server may listen at the second alone, as one of 127.0.0.1 where ``localhost`` is ::1 first: clients get there."""
+    """The server may listen on the second only, as on 127.0.0.1 if ``localhost`` is ::1 first: clients reach it."""
     told = [
         (socket.AF_INET6, socket.SOCK_STREAM, 6, '', ('::1', 0, 0, 0)),
         (socket.AF_INET, socket.SOCK_STREAM, 6, '', ('127.0.0.1', 0)),
@@ -145,7 +145,7 @@ def test_every_address_of_a_name_is_tried(with_tower: Scene, monkeypatch: pytest
 
 
 def test_missing_parts_of_a_tower_are_named(with_tower: Scene, servers: Tower) -> None:
-    """Its own keys see all buckets; those of the guide that are not there are named, and can be made."""
+    """Its keys list all buckets; missing ones of the guide are named, and can be created."""
     with_tower.role = Role.SERVER
     with_tower.environ |= servers.environment('tower')
     admin = S3Client(servers.store_settings(), UploadSettings())

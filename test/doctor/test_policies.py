@@ -1,4 +1,4 @@
-"""What the doctor says of the policies of a robot, without asking the store or the registry."""
+"""The doctor's findings about a robot's policies, without requests to the store or the registry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NAME = f'go2_patrol@1#{"a" * 16}'
 
 
 def activate(scene: Scene, isolation: str) -> None:
-    """A version whose smoke run was in this isolation; no root of trust is installed."""
+    """Activate a version whose smoke run had this isolation; no root of trust is installed."""
     folder = PolicyFolder(scene.folder / 'home')
     folder.make()
     (folder.versions.path / NAME).mkdir()
@@ -26,7 +26,7 @@ def activate(scene: Scene, isolation: str) -> None:
     ('sandbox', ['policies.stale']), ('limits', ['policies.stale', 'policies.isolation']),
 ])  # fmt: skip
 def test_a_policy_that_was_tried_without_a_sandbox_is_reported(scene: Scene, isolation: str, checks: list[str]) -> None:
-    """So is a robot without a root of trust: it takes no new version."""
+    """So is a robot without a root of trust: it accepts no new version."""
     activate(scene, isolation)
     found = scene.findings('policies')
     assert [result.check for result in found] == checks

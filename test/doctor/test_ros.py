@@ -32,22 +32,22 @@ RATES = {'odom': 20.0, 'imu': 20.0, 'point_cloud2': 20.0}
 
 @dataclass(frozen=True)
 class Examined:
-    """What was found of each robot, in the domain where they are, and by somebody in another one."""
+    """The findings for each robot, in their domain, and in another one."""
 
     domain: int
     robots: dict[str, list[Result]]
     elsewhere: list[Result]
     nowhere: list[Result]
     unnamed: list[Result]
-    """Of a logger without a namespace."""
+    """For a logger without a namespace."""
     foreign: list[Result]
-    """Of a logger for another robot."""
+    """For a logger of another robot."""
     by_type: list[Result]
-    """Of a logger without settings."""
+    """For a logger without settings."""
 
 
 def examine(scene: Scene, namespace: str = '/', sensors: dict[str, Any] = SENSORS) -> list[Result]:
-    """In this process, whose ROS is loaded once; the check itself is what a child of the doctor runs."""
+    """In this process, which loads ROS once; the check is the one that a child of the doctor runs."""
     from shadowhound_data_logger.doctor import ros
 
     context = make(scene.environ, role=scene.role, parameters=sensors, namespace=namespace, rates_hz=RATES, root=scene.root)
@@ -80,7 +80,7 @@ def examined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Examined]:
 
 
 def test_a_topic_under_another_name_is_proposed(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With and without a slash they are the same in the root namespace: two sensors of it are both judged."""
+    """With and without a slash they are the same in the root namespace: both sensors of it are checked."""
     from shadowhound_data_logger.doctor import ros, ros_watch
 
     here = SimpleNamespace(
@@ -100,7 +100,7 @@ def findings(results: list[Result]) -> list[Result]:
 
 
 def test_a_healthy_robot_gives_no_finding(examined: Examined) -> None:
-    """Each topic with about the rate at which it was published; but a busy machine loses messages."""
+    """Each topic has about the published rate; but a busy machine loses messages."""
     found = examined.robots['well']
     assert [each for each in findings(found) if each.check != 'ros.loss'] == []
     rates = {result.data['topic']: result.data['rate_hz'] for result in found if result.check == 'ros.rate'}
@@ -124,29 +124,29 @@ FAULTS = {
 
 @pytest.mark.parametrize(('robot', 'name', 'words'), FAULTS.values(), ids=FAULTS)
 def test_a_fault_is_found_and_named(examined: Examined, robot: str, name: str, words: tuple[str, ...]) -> None:
-    """By one finding alone, whose remedy is the right one; but a busy machine loses messages of each of them."""
+    """By exactly one finding, with the correct remedy; but a busy machine loses messages of each of them."""
     found = findings(examined.robots[robot])
     expect([each for each in found if each.check == name or each.check != 'ros.loss'], name, *words)
 
 
 def test_a_wrong_domain_is_named(examined: Examined) -> None:
-    """Where the topics are in another domain, it is that one that is named."""
+    """If the topics are in another domain, that one is named."""
     expect(findings(examined.elsewhere), 'ros.domain', f'export ROS_DOMAIN_ID={examined.domain}')
 
 
 def test_a_missing_driver_is_named(examined: Examined) -> None:
-    """Where nobody is anywhere, the guide's three questions are asked."""
+    """If there are no participants anywhere, the guide's three questions are in the remedy."""
     expect(findings(examined.nowhere), 'ros.topics', 'go2_driver', 'robot.launch.py', 'ROS_DOMAIN_ID')
 
 
 def test_a_robot_in_a_namespace_is_named(examined: Examined) -> None:
-    """As a driver of several robots publishes: the topics that are there are named, and how to log one robot's."""
+    """As a driver of several robots publishes: the existing topics are named, and how to log one robot's."""
     expect(findings(examined.unnamed), 'ros.topics', '-r __ns:=/', 'one node for each of', '/well')
     assert '/deaf/imu' in findings(examined.unnamed)[0].seen
 
 
 def test_no_command_has_a_name_that_is_invalid_in_ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another participant of DDS chooses the names of its topics."""
+    """Another DDS participant chooses the names of its topics."""
     from shadowhound_data_logger.doctor import ros_watch
 
     names = ['/robot0/odom', '/$(reboot)/odom', '/a;b/odom', '/a b/odom', '/a\nb/odom', '/rosout', '/_hidden/odom']
@@ -196,7 +196,7 @@ def test_a_robot_of_another_kind_is_named(examined: Examined) -> None:
 
 
 def test_topics_that_are_logged_by_their_type_are_examined(examined: Examined) -> None:
-    """A camera that publishes nothing is found, and no topic of a Go2 is missed; a command that nobody gives is no fault."""
+    """A camera that publishes nothing is found, and no topic of a Go2 is missed; a command topic without messages is fine."""
     found = findings(examined.by_type)
     expect([each for each in found if '/other/scan' not in each.seen], 'ros.loss', 'ros2 topic hz /other/front/image')
     assert '/other/scan' in {result.data.get('topic') for result in examined.by_type if result.check == 'ros.rate'}
@@ -204,7 +204,7 @@ def test_topics_that_are_logged_by_their_type_are_examined(examined: Examined) -
 
 @pytest.mark.long('a robot of its own')
 def test_missing_go2_interfaces_are_named(scene: Scene, domain: int, tmp_path: Path) -> None:
-    """In the doctor's own process for ROS, with a workspace that was not sourced."""
+    """In the doctor's child process for ROS, with a workspace that was not sourced."""
     (tmp_path / 'go2_interfaces').mkdir()
     (tmp_path / 'go2_interfaces/__init__.py').write_text("raise ImportError('not sourced')")
     path = os.pathsep.join(filter(None, [str(tmp_path), scene.environ.get('PYTHONPATH')]))
@@ -215,12 +215,12 @@ def test_missing_go2_interfaces_are_named(scene: Scene, domain: int, tmp_path: P
     assert 'go2_interfaces/msg/Go2State' in found['ros.types'].seen
     assert 'IMU' not in found['ros.types'].seen
     assert 'colcon build --packages-select go2_interfaces' in found['ros.types'].remedy
-    assert 'ros.topics' in found  # and all else was asked as well
+    assert 'ros.topics' in found  # and everything else was checked as well
 
 
 @pytest.mark.long('a robot and a node with Cyclone DDS')
 def test_a_robot_with_cyclone_dds_is_watched_through_the_nodes_rmw(scene: Scene, domain: int) -> None:
-    """Through Fast DDS, with numbers, though the variables of the shell name an RMW that numbers nothing."""
+    """Through Fast DDS, with sequence numbers, though the variables of the shell name an RMW without them."""
     pytest.importorskip('cyclonedds')
     driver = Path(__file__).parents[1] / 'e2e/finding.py'
     own = {'ROS_DOMAIN_ID': str(domain)}

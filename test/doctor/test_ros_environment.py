@@ -1,4 +1,4 @@
-"""What is around the topics: sim time without a clock, frames that do not move, a Zenoh router that is down."""
+"""The environment of the topics: sim time without a clock, frames that do not move, a Zenoh router that is down."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def checks(found: Any) -> list[tuple[str, bool]]:
 
 @pytest.mark.parametrize(('publishers', 'nodes', 'findings'), [(0, ['nav2', 'rviz'], 1), (1, ['nav2'], 0), (0, [], 0)])
 def test_sim_time_without_a_clock_is_a_finding(publishers: int, nodes: list[str], findings: int) -> None:
-    """Nodes that listen to /clock while nothing publishes it are named, with what to do."""
+    """Nodes that subscribe to /clock while it has no publisher are named, with the remedy."""
     asked = [SimpleNamespace(node_namespace='/', node_name=name) for name in nodes]
     node: Any = SimpleNamespace(count_publishers=lambda _: publishers, get_subscriptions_info_by_topic=lambda _: asked)
     found = list(ros._clock(ros_watch.waiting_for_clock(node)))
@@ -56,7 +56,7 @@ def test_frames_that_do_not_move_are_a_finding(received: int, age_s: float | Non
 
 
 def test_an_unreachable_zenoh_router_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that answers is fine, one that does not is a finding, and one that a configuration names is not looked for."""
+    """One that responds is fine, one that does not is a finding, and one named in a configuration is not checked."""
     with closing(socket.create_server(('localhost', 0))) as server:
         monkeypatch.setattr(ros_environment, 'ROUTER', ('localhost', server.getsockname()[1]))
         given = {'RMW_IMPLEMENTATION': 'rmw_zenoh_cpp'}

@@ -1,4 +1,4 @@
-"""The runner: what hangs, crashes or is not reached is in the answer, and the answer comes in time."""
+"""The runner: checks that hang, crash or are not reached are in the result, which arrives before the deadline."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(scene: Scene, *wanted: Check, timeout_s: float = 60.0) -> list[Result]:
 
 
 def test_a_crash_is_a_finding_and_stops_no_other_check(scene: Scene) -> None:
-    """What the check said before, and what the others say, is there as well."""
+    """The earlier results of the check, and those of the others, are there as well."""
     found = run(scene, Check(name='crashing', run=crashing), Check(name='fine', run=fine))
     assert [result.check for result in found] == ['crashing.one', 'crashing.crash', 'fine.one']
     assert 'ZeroDivisionError: no number' in found[1].seen
@@ -39,7 +39,7 @@ def test_a_crash_is_a_finding_and_stops_no_other_check(scene: Scene) -> None:
 
 
 def test_a_hung_check_is_a_finding_at_its_deadline(scene: Scene) -> None:
-    """Also where that leaves no time for what comes after it, which is said."""
+    """Also if no time is left for later checks, which is reported."""
     over = threading.Event()
 
     def hangs(_: Context) -> Iterator[Result]:
@@ -67,7 +67,7 @@ def test_a_check_with_its_own_deadline_leaves_time_for_the_others(scene: Scene) 
 
 
 def test_a_check_sees_the_results_of_earlier_checks(scene: Scene) -> None:
-    """By the checks that come after, which wait for it."""
+    """Later checks wait for it."""
     seen: list[Result | None] = []
 
     def later(context: Context) -> Iterator[Result]:
@@ -83,21 +83,21 @@ def test_a_check_sees_the_results_of_earlier_checks(scene: Scene) -> None:
 
 
 def test_checks_run_side_by_side(scene: Scene) -> None:
-    """Two that wait for each other both end."""
+    """Two that wait for each other both finish."""
     meeting = threading.Barrier(2, timeout=60.0)
     wait = [Check(name=name, run=lambda _: iter([ok('met', str(meeting.wait()))])) for name in ('a', 'b')]
     assert sorted(result.check for result in run(scene, *wait)) == ['met', 'met']
 
 
 def test_a_crashed_process_is_a_finding(scene: Scene) -> None:
-    """With the last words it said: here, that there is no such check."""
+    """With its last output: here, that there is no such check."""
     (found,) = in_child(Running(Check(name='nothing', run=fine)), scene.context())
     assert found.check == 'nothing.crash'
     assert 'StopIteration' in found.seen
 
 
 def test_a_process_that_hangs_is_killed(scene: Scene) -> None:
-    """Whether it was under way or just about to begin when it was given up."""
+    """Whether it was running or about to start at the deadline."""
     running = Running(Check(name='hangs', run=fine))
     children = [subprocess.Popen(['sleep', '60']) for _ in range(2)]
     running.adopt(children[0])
@@ -108,7 +108,7 @@ def test_a_process_that_hangs_is_killed(scene: Scene) -> None:
 
 @pytest.mark.parametrize('role', Role)
 def test_every_role_has_its_checks(role: Role) -> None:
-    """Names are unique, and what a check comes after is there for all its roles."""
+    """Names are unique, and the prerequisites of a check exist for all its roles."""
     mine = {check.name: check for check in checks.CHECKS if role in check.roles}
     assert len(mine) >= 6
     assert len({check.name for check in checks.CHECKS}) == len(checks.CHECKS)
@@ -116,7 +116,7 @@ def test_every_role_has_its_checks(role: Role) -> None:
 
 
 def test_without_a_network_the_examination_ends_in_time(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing answers, not even the name server: it ends within the bar, each service is named, and the rest is asked."""
+    """Nothing responds, not even the DNS server: it ends before the limit, each service is named, and other checks run."""
     over = threading.Event()
 
     def resolve(*_: object, **__: object) -> list[object]:

@@ -1,7 +1,4 @@
-"""What the doctor finds at an S3 server, with the one of a Tower.
-
-What the doctor says of a server where several create one object at once.
-"""
+"""Findings about an S3 server, with that of a Tower, and about a server on which clients create one object concurrently."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ from shadowhound_data_logger.stores.s3_requests import S3Requests
 
 @pytest.mark.seaweedfs
 def test_probe_objects_do_not_pile_up(with_tower: Scene, servers: Tower) -> None:
-    """However often the robot asks, there is one in each bucket; Tower's own is deleted again."""
+    """However often the robot checks, there is one in each bucket; Tower's own is deleted again."""
     for role, user in ((Role.ROBOT, 'thor'), (Role.ROBOT, 'thor'), (Role.SERVER, 'tower')):
         with_tower.role = role
         with_tower.environ |= servers.environment(user)
@@ -43,7 +40,7 @@ def test_probe_objects_do_not_pile_up(with_tower: Scene, servers: Tower) -> None
 
 @pytest.mark.seaweedfs
 def test_a_seaweedfs_without_keys_is_named(with_tower: Scene, tmp_path: Path) -> None:
-    """Each server that answers a stranger, once, with the way to close it; with the signing keys alone, those that still do."""
+    """Each server that responds without keys, once, with the remedy; with the signing keys alone, those that still do."""
     with open_seaweed(tmp_path / 'open') as ports:
         with_tower.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{ports["s3"]}'
         found = with_tower.findings('network.s3', 'seaweedfs')
@@ -59,7 +56,7 @@ def test_a_seaweedfs_without_keys_is_named(with_tower: Scene, tmp_path: Path) ->
 
 @pytest.mark.seaweedfs
 def test_keys_without_rights_are_named_for_each_bucket(with_tower: Scene, servers: Tower) -> None:
-    """Each bucket is named, with the policy that it takes."""
+    """Each bucket is named, with the policy that it needs."""
     with_tower.environ |= servers.environment('stranger')
     found = with_tower.findings('s3')
     assert {result.check for result in found} == {'s3.write'}
@@ -68,14 +65,14 @@ def test_keys_without_rights_are_named_for_each_bucket(with_tower: Scene, server
 
 @pytest.mark.seaweedfs
 def test_a_server_that_verifies_nothing_is_a_finding(with_tower: Scene) -> None:
-    """Neither checksums nor signatures: both promises that a put relies on are asked for."""
+    """Neither checksums nor signatures: both guarantees that a put relies on are tested."""
     imitated()(with_tower)
     assert {result.check for result in with_tower.findings('s3')} == {'s3.checksum', 's3.open'}
 
 
 @pytest.mark.seaweedfs
 def test_minio_is_mentioned_without_a_finding(with_tower: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such Towers go on working; what it means that nobody maintains it is said."""
+    """Such Towers keep working; the result explains that it is no longer maintained."""
     monkeypatch.setattr('stores.fake_s3.Handler.version_string', lambda _: 'MinIO')
     imitated()(with_tower)
     told = {result.check: result for result in with_tower.ask('s3')}
@@ -100,7 +97,7 @@ def raced(server: FakeS3) -> Iterator[Result]:
 
 @pytest.mark.parametrize(('winners', 'severity'), [(1, Severity.OK), (2, Severity.WARNING)])
 def test_a_server_with_two_winners_is_reported(winners: int, severity: Severity) -> None:
-    """How many won is in it, and nothing is left in the store."""
+    """The number of winners is in it, and nothing is left in the store."""
     server = FakeS3()
     if winners > 1:
         server.races = {f'/sensor-data/thor/_doctor/{name}': threading.Barrier(s3.RACERS) for name in NAMES}

@@ -1,4 +1,4 @@
-"""Recorded bags in a store, read by other libraries than the one that wrote them."""
+"""Recorded bags in a store, read by libraries other than the one that wrote them."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ class Bag:
 
     @property
     def slices(self) -> list[Path]:
-        """In the order of their numbers."""
+        """Sorted by number."""
         return sorted(self.folder.glob('*.mcap'), key=lambda path: int(path.stem.rpartition('_')[2]))
 
     def messages(self) -> Iterator[Recorded]:
-        """All of them, by the mcap package, which checks the chunks' sums."""
+        """All messages, read by the mcap package, which verifies the chunks' checksums."""
         for path in self.slices:
             yield from in_slice(path)
 
     def check(self) -> Counter[str]:
-        """All readers find the same, and the manifest tells it; topic -> messages."""
+        """All readers find the same, in agreement with the manifest; topic -> messages."""
         counts: Counter[str] = Counter()
         for said in self.manifest['slices']:
             path = self.folder / said['file']
@@ -83,7 +83,7 @@ def bags(store: ObjectStore, robot: str, folder: Path) -> list[Bag]:
 
 
 def by_topic(messages: Iterable[Recorded | Heard]) -> dict[str, list[Any]]:
-    """In the order in which they come."""
+    """In recorded order."""
     found: dict[str, list[Any]] = {}
     for message in messages:
         found.setdefault(message.topic, []).append(message)

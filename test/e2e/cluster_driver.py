@@ -1,7 +1,7 @@
-"""Asks the tables of a lake with Daft, in this process or on a Ray cluster; used by test_two_nodes.py.
+"""Queries the tables of a lake with Daft, in this process or on a Ray cluster; used by test_two_nodes.py.
 
 Reads a JSON document: ``runner`` (the address of a cluster, or null), ``table`` (the folder of the tables), ``options`` of S3,
-``near`` (x, y, radius), and ``mark``: a file that tasks on another node than this one make, which then take a while.
+``near`` (x, y, radius), and ``mark``: a file created by tasks that run on another node, which then take a while.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Program of a test, ``confined_node.py PID INTERFACE ...``: the node in the network of that process, by that interface.
+"""Program of a test, ``confined_node.py PID INTERFACE ...``: the node in the network of that process, on that interface.
 
-Its front is not confined, as the programs of a robot are not, and comparing takes no longer than a test should.
+Its front is not confined, like the robot's other programs, and the comparison interval is short.
 """
 
 import os

@@ -22,11 +22,11 @@ from shadowhound_data_logger.stores.s3 import S3Store
 pytest.importorskip('rclpy')
 
 LIVE: list[Processes] = []
-"""Whose logs are shown when a test fails."""
+"""The processes with logs that are shown when a test fails."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """All of this folder needs ROS and an S3 server."""
+    """All tests of this folder need ROS and an S3 server."""
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.ros)
@@ -35,7 +35,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:  # type: ignore[misc]  # its wrapped result is returned
-    """Show the logs of what runs when a test fails."""
+    """Show the logs of running processes when a test fails."""
     report: pytest.TestReport = yield  # type: ignore[assignment, misc]
     if report.failed:
         report.sections += [section for started in LIVE for section in started.logs()]
@@ -44,7 +44,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:  # type: ign
 
 @contextmanager
 def running(folder: Path) -> Iterator[Processes]:
-    """Processes in a domain of their own; whatever happens, none of them stays."""
+    """Processes in a separate domain; all are stopped at the end, whatever happens."""
     with free_domain() as domain:
         processes = Processes(folder, domain, f'r{secrets.token_hex(4)}', forked=True)
         LIVE.append(processes)
@@ -57,7 +57,7 @@ def running(folder: Path) -> Iterator[Processes]:
 
 @pytest.fixture(scope='module')
 def store(seaweed: Tower) -> Iterator[S3Store]:
-    """The server as our own programs read it."""
+    """The server, as our programs read it."""
     opened = S3Store(seaweed.store_settings(), UploadSettings())
     opened.open()
     yield opened
@@ -66,7 +66,7 @@ def store(seaweed: Tower) -> Iterator[S3Store]:
 
 @pytest.fixture
 def station(processes: Processes) -> Iterator[Station]:
-    """Another node of the robot, which calls services and hears topics."""
+    """Another node of the robot, which calls services and subscribes to topics."""
     made = Station(processes.environ)
     yield made
     made.close()
@@ -80,14 +80,14 @@ def processes(tmp_path: Path) -> Iterator[Processes]:
 
 @pytest.fixture(scope='module')
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    """Processes that the tests of a module share, each test with topics of its own."""
+    """Processes shared by the tests of a module, each with separate topics."""
     with running(tmp_path_factory.mktemp('shared')) as started:
         yield started
 
 
 @pytest.fixture(scope='session')
 def session(tmp_path_factory: pytest.TempPathFactory, seaweed: Tower) -> Session:
-    """Of a simulated Go2, for those who look at its sensors and those who look at its bag."""
+    """A simulated Go2, for tests of its sensors and of its bag."""
     with (
         running(tmp_path_factory.mktemp('session')) as processes,
         closing(S3Store(seaweed.store_settings(), UploadSettings())) as store,
@@ -98,7 +98,7 @@ def session(tmp_path_factory: pytest.TempPathFactory, seaweed: Tower) -> Session
 
 @pytest.fixture(scope='module')
 def stored(seaweed: Tower) -> Iterator[Callable[..., Objects]]:
-    """Reads back what the store holds of a robot."""
+    """Reads the stored objects of a robot."""
     with ExitStack() as stack:
         store = S3Store(seaweed.store_settings(), UploadSettings())
         store.open()

@@ -1,7 +1,7 @@
-"""Program of tests: a neighbor in the robot's ROS domain, with many topics, and publishers that come and go.
+"""Program of tests: another participant in the robot's ROS domain, with many topics, and publishers that come and go.
 
-Standard input: ``topics N BYTES`` makes N publishers of Strings that publish once a second from then on, ``churn N`` makes N
-more that publish a few messages each and go, ``leave`` ends all of them. Each is answered with ``done``.
+Standard input: ``topics N BYTES`` creates N publishers of Strings that publish once per second from then on, ``churn N``
+creates N more that publish a few messages each and leave, ``leave`` removes all of them. The response to each is ``done``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32, String
 
 AT_ONCE: Final = 50
-"""Publishers that live together; two of three on topics that are there already."""
+"""Publishers that exist at the same time; two of three on existing topics."""
 MESSAGES: Final = 3
 REST_S: Final = 0.05
 KINDS: Final = (
@@ -31,7 +31,7 @@ KINDS: Final = (
 
 
 class Crowd:
-    """One participant; a thread of its own keeps the standing publishers talking."""
+    """One participant; a separate thread publishes for the permanent publishers."""
 
     def __init__(self) -> None:
         self.node = Node('crowd', start_parameter_services=False, enable_rosout=False)

@@ -1,4 +1,4 @@
-"""Program of a test: a robot that speaks Cyclone DDS, without ROS. It obeys what ``publisher.py`` does, and can listen as well.
+"""Program of a test: a robot with Cyclone DDS, without ROS. It takes the commands of ``publisher.py``, and can subscribe as well.
 
 Topics and types have the names that ROS gives them (``rt/imu``, ``sensor_msgs::msg::dds_::Imu_``), final types in XCDR1
 (https://design.ros2.org/articles/topic_and_service_names.html); the definitions are those of rosbags.
@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cyclonedds._clayer import ddspy_take, ddspy_write  # bytes as they are, which is what a driver in C++ has
+from cyclonedds._clayer import ddspy_take, ddspy_write  # raw bytes, as a driver in C++ has them
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct
@@ -32,7 +32,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 MATCH_S = 120.0
 BLOCK_S = 1.0
-"""As rmw_cyclonedds_cpp: how long a RELIABLE writer waits for readers that do not keep up."""
+"""As in rmw_cyclonedds_cpp: how long a RELIABLE writer waits for slow readers."""
 TAKE_S = 0.002
 NOT_READ = 0
 INTERFACES = Path(__file__).parents[2] / 'interfaces'
@@ -68,7 +68,7 @@ class Types:
 
 
 def as_ros_has_it(environ: Mapping[str, str]) -> str:
-    """CYCLONEDDS_URI as rmw_cyclonedds_cpp completes it from the variables of ROS; AS_HUMBLE is set for that of Humble.
+    """CYCLONEDDS_URI as rmw_cyclonedds_cpp completes it from the variables of ROS; AS_HUMBLE selects that of Humble.
 
     Source: ``check_create_domain`` of rmw_node.cpp, 1.3.4 and 4.0.
     """
@@ -141,19 +141,19 @@ class Driver:
         return None
 
     def take(self) -> None:
-        """For ever: count what comes."""
+        """Count received messages in an endless loop."""
         while True:
             time.sleep(TAKE_S)
             self.poll()
 
     def poll(self) -> None:
-        """Count what came meanwhile."""
+        """Count the messages received since the last poll."""
         with self._lock:
             for topic, reader in self._readers.items():
                 self._counts[topic] += sum(bool(info.valid_data) for _, info in ddspy_take(reader._ref, NOT_READ, 100))
 
     def close(self) -> None:
-        """Leave as a node should, so that the others know at once."""
+        """Leave the graph properly, so that others notice immediately."""
         with self._lock:
             for entities in (self._readers, self._writers, self._topics):
                 entities.clear()
@@ -170,7 +170,7 @@ class Driver:
         end = time.monotonic() + MATCH_S
         while self._writers[topic].get_publication_matched_status().current_count < count:
             if time.monotonic() > end:
-                raise TimeoutError(f'nobody listens to {topic}')
+                raise TimeoutError(f'no subscription to {topic}')
             time.sleep(0.005)
 
     def _publish(self, topic: str, messages: list[bytes], period_s: float) -> None:
@@ -181,7 +181,7 @@ class Driver:
             self._write(topic, message)
 
     def _write(self, topic: str, message: bytes) -> int:
-        """Less than 0 where it was not sent (dds/ddsrt/retcode.h)."""
+        """Less than 0 if it was not sent (dds/ddsrt/retcode.h)."""
         return int(ddspy_write(self._writers[topic]._ref, message))
 
     def _write_or_raise(self, topic: str, message: bytes) -> None:

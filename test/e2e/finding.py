@@ -1,8 +1,8 @@
-"""Program of a test, once on each of two machines: whom does who listen to ``/here`` and ``/there``?
+"""Program of a test, once on each of two machines: which participants receive from which on ``/here`` and ``/there``?
 
 ``publish TOPIC CASES`` publishes as a robot with Cyclone DDS in each of the cases, ``listen CASES`` is a reader of such a robot,
-and ``find VARIABLES`` listens as the node does, in one case. Cases are JSON, a list of variables. What was heard is printed as
-one line of JSON for each line on standard input.
+and ``find VARIABLES`` subscribes as the node does, in one case. Cases are JSON, a list of variables. What was received is
+printed as one line of JSON for each line on standard input.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MESSAGE = b'\0\1\0\0\2\0\0\0x\0'
 
 
 def publish(topic: str, cases: Sequence[Mapping[str, str]]) -> None:
-    """For ever."""
+    """Publish in an endless loop."""
     from e2e.cyclone_driver import Driver
 
     drivers = [Driver(case) for case in cases]
@@ -57,7 +57,7 @@ def find(case: Mapping[str, str]) -> None:
     """A list of topics."""
     from shadowhound_data_logger.node.intake.middleware import RMW, choose
 
-    loaded = choose('fastrtps', os.environ | {RMW: case[RMW]}).profile_variable  # whatever version the case pretends to have
+    loaded = choose('fastrtps', os.environ | {RMW: case[RMW]}).profile_variable  # whichever version the case simulates
     middleware = replace(choose('fastrtps', os.environ | case), profile_variable=loaded)
     os.environ.update(case)
     middleware.enter(os.environ)
@@ -82,7 +82,7 @@ def find(case: Mapping[str, str]) -> None:
 
 
 def answer(heard: Callable[[], object]) -> None:
-    """Until standard input ends."""
+    """Respond until the end of standard input."""
     say('ready')
     for _ in sys.stdin:
         say(json.dumps(heard()))
@@ -94,13 +94,13 @@ def say(line: str) -> None:
 
 
 def end() -> None:
-    """A publisher, with whoever started it."""
+    """Stop a publisher along with its parent."""
     sys.stdin.read()
     os._exit(0)
 
 
 def main(what: str, *given: str) -> None:
-    """See the module."""
+    """Run the command of the arguments."""
     if what == 'publish':
         threading.Thread(target=end, daemon=True).start()
         publish(given[0], json.loads(given[1]))

@@ -1,4 +1,4 @@
-"""Program of a test: the node as it is on a robot with another RMW, whose front speaks the same one as the node itself."""
+"""Program of a test: the node as on a robot with another RMW, with a front that uses the same RMW as the node itself."""
 
 import sys
 

@@ -1,10 +1,10 @@
-"""What Humble's rclpy lacks, hidden from our package in a newer one: copied as sitecustomize.py to where a Python finds it.
+"""Hides from our package what Humble's rclpy lacks: copied as sitecustomize.py to a folder on Python's path.
 
-What there is in Humble is in ``rclpy_humble.json``, which ``rclpy_names.py`` makes from rclpy's source. Any other module,
-function, class or member of a class raises AttributeError (ImportError) for whoever is of our package; rclpy goes on using it.
-``HUMBLE_RMW`` is the RMW to stand in for: rmw_cyclonedds_cpp tells less than rmw_fastrtps_cpp.
+The names of Humble are in ``rclpy_humble.json``, which ``rclpy_names.py`` generates from rclpy's source. Any other module,
+function, class or class member raises AttributeError (ImportError) in our package; rclpy itself still uses it.
+``HUMBLE_RMW`` is the RMW to imitate: rmw_cyclonedds_cpp provides less than rmw_fastrtps_cpp.
 
-Sources of what is not a name: rmw 6.1 (RMW_GID_STORAGE_SIZE), rmw_cyclonedds_cpp 1.3 (received_timestamp).
+Sources of details other than names: rmw 6.1 (RMW_GID_STORAGE_SIZE), rmw_cyclonedds_cpp 1.3 (received_timestamp).
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ import rclpy
 OURS = 'shadowhound_data_logger'
 FACTS = json.loads(Path(os.environ['RCLPY_NAMES']).read_text(encoding='utf-8'))
 RENAMED = {'rclpy.qos_event': 'rclpy.event_handler', 'QoSEvent': 'EventHandle'}
-"""What is in Humble and has another name now."""
+"""Names in Humble that are different now."""
 GID_BYTES = 24
 CYCLONE_DDS = os.environ['HUMBLE_RMW'] == 'rmw_cyclonedds_cpp'
 
 
 def asked_by_us(depth: int = 2) -> bool:
-    """Whether the caller of our caller is of our package."""
+    """Whether the caller of our caller is in our package."""
     return str(sys._getframe(depth).f_globals.get('__name__', '')).startswith(OURS)
 
 
 class Hidden:
-    """A member of a class that Humble does not have."""
+    """A class member that Humble does not have."""
 
     def __init__(self, name: str, hidden: Any) -> None:
         self.name, self.hidden = name, hidden
@@ -50,14 +50,14 @@ class Hidden:
 
 
 class HiddenProperty(Hidden):
-    """One that can be assigned to."""
+    """A hidden member that can be assigned to."""
 
     def __set__(self, instance: Any, value: Any) -> None:
         type(self.hidden).__set__(self.hidden, instance, value)
 
 
 class Guarded(ModuleType):
-    """A module of which we see what Humble has."""
+    """A module that only shows Humble's names to our package."""
 
     def __getattribute__(self, name: str) -> Any:
         get = super().__getattribute__
@@ -71,7 +71,7 @@ class Guarded(ModuleType):
 
 
 def members(cls: type) -> set[str]:
-    """What a class has in Humble, where it may be in another module; nothing where it is not there."""
+    """The members of a class in Humble, where it may be in another module; empty if Humble does not have it."""
     modules = FACTS['modules']
     places = (
         [modules[cls.__module__]] if cls.__name__ in modules.get(cls.__module__, {'classes': ()})['classes'] else modules.values()
@@ -80,7 +80,7 @@ def members(cls: type) -> set[str]:
 
 
 def hide_members(cls: type) -> None:
-    """Those of a class that it does not have in Humble, nor one that it inherits from."""
+    """Hide the members that neither the class nor its bases have in Humble."""
     known = {name for each in cls.__mro__ for name in members(each)}
     for name, member in list(vars(cls).items()):
         if not name.startswith('__') and name not in known and not isinstance(member, type):
@@ -89,9 +89,9 @@ def hide_members(cls: type) -> None:
 
 
 def hide() -> None:
-    """All of it, once everything of rclpy is loaded."""
+    """Hide everything, after all of rclpy is loaded."""
     for found in pkgutil.walk_packages(rclpy.__path__, 'rclpy.'):
-        with suppress(ImportError):  # some are for rclpy's own tests
+        with suppress(ImportError):  # some exist for rclpy's tests
             importlib.import_module(found.name)
     for name, module in list(sys.modules.items()):
         if name.partition('.')[0] != 'rclpy' or not isinstance(module, ModuleType):
@@ -109,12 +109,12 @@ def hide() -> None:
 
 
 def special(cls: type) -> bool:
-    """Enumerations and tuples have members of their own making."""
+    """Enumerations and tuples generate their members."""
     return issubclass(cls, (Enum, tuple, BaseException)) or hasattr(cls, '__members__')
 
 
 def behave() -> None:
-    """What rclpy and the RMW tell in Humble."""
+    """Return from rclpy and the RMW what they return in Humble."""
     from rclpy import utilities
     from rclpy.impl.implementation_singleton import rclpy_implementation as compiled
     from rclpy.node import Node

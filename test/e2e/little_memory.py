@@ -1,4 +1,4 @@
-"""``little_memory.py MODULE ...``: run a module where /dev/shm has 40 MB, of which a process that was killed has left 39."""
+"""``little_memory.py MODULE ...``: run a module with a /dev/shm of 40 MB, 39 of them left over by a killed process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INSIDE = 'LITTLE_MEMORY'
 
 
 def main() -> None:
-    """In a mount namespace of its own."""
+    """Run in a separate mount namespace."""
     if INSIDE not in os.environ:
         os.environ[INSIDE] = 'yes'
         os.execvp('unshare', ['unshare', '--mount', sys.executable, *sys.argv])  # noqa: S606 - this very program

@@ -1,4 +1,4 @@
-"""Frames of the live page's WebSocket, put together as a browser does it."""
+"""Frames of the live page's WebSocket, assembled as in a browser."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, BEGIN, END, SMALL_
 
 
 class Frames:
-    """What one connection has received."""
+    """The frames received on one connection."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -17,7 +17,7 @@ class Frames:
         self._parts: dict[int, bytes] = {}
 
     def take(self, frame: bytes) -> list[tuple[dict[str, Any], bytes]]:
-        """Head and body of each item that this frame ends."""
+        """Head and body of each item that this frame completes."""
         self.bytes += len(frame)
         lane, flags = frame[:2]
         if lane == SMALL_LANE:
@@ -27,7 +27,7 @@ class Frames:
         return [opened(self._parts.pop(lane))] if flags & END else []
 
     def acknowledgement(self) -> bytes | None:
-        """What is to be said now, if anything is."""
+        """The acknowledgement to send now, if any."""
         if self.bytes - self._told < ACKNOWLEDGED:
             return None
         self._told = self.bytes

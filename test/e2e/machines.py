@@ -27,7 +27,7 @@ ip addr add {SECOND}/24 dev wlan0
 ip link set wlan0 up
 ip link set nobody up
 """
-"""The robot has a second interface, with nobody on it."""
+"""The robot has a second interface, without a peer."""
 JOIN = f'set -e; ip link set lo up; ip addr add {OTHER}/24 dev eth1; ip link set eth1 up'
 NOBODY = 'lladdr 02:00:00:00:00:99 nud permanent'
 LISTEN = """
@@ -39,25 +39,25 @@ told.sendmsg([b'x'], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array('i', [l
 
 
 class Machines:
-    """Two of them, in a user namespace of their own where this user is not root; both end with ``stack``."""
+    """Two machines, in a separate user namespace if this user is not root; both end with ``stack``."""
 
     def __init__(self, stack: ExitStack, robot: int = 0) -> None:
-        """Skips where this user may make none. ``robot`` is a process in a network of its own that becomes the robot's."""
+        """Skips if this user may not create namespaces. ``robot`` is a process whose separate network becomes the robot's."""
         self._stack = stack
         user = [] if os.geteuid() == 0 else ['--user', '--map-root-user']
         self.robot = robot or self._hold(['unshare', *user, '--net'])
-        """A process there, for ``inside``."""
+        """A process on the robot, for ``inside``."""
         self.other = self._hold([*inside(self.robot), 'unshare', '--net'])
-        """The same of the other one."""
+        """A process on the other machine."""
         self._run(self.robot, MAKE, str(self.other))
         self._run(self.other, JOIN)
 
     def join_networks(self) -> None:
-        """From now on the other machine reaches the robot's second interface as well."""
+        """Also let the other machine reach the robot's second interface."""
         self._run(self.other, f'ip route add {SECOND} via {ROBOT}')
 
     def cut(self) -> None:
-        """From now on nothing that one of them sends reaches the other, and neither is told so."""
+        """Drop all packets between the machines, silently."""
         self._run(self.robot, f'ip neigh replace {OTHER} dev eth0 {NOBODY}')
         self._run(self.other, f'ip neigh replace {ROBOT} dev eth1 {NOBODY}')
 
@@ -66,14 +66,14 @@ class Machines:
         self._run(self.other, f'ip neigh del {ROBOT} dev eth1')
 
     def program(self, name: str, folder: Path) -> str:
-        """A file that runs that program at the other machine."""
+        """A file that runs that program on the other machine."""
         path = folder / Path(name).name
         path.write_text(f'#!/bin/sh\nexec {shlex.join([*inside(self.other), name])} "$@"\n')
         path.chmod(0o755)
         return str(path)
 
     def listener(self) -> socket.socket:
-        """A socket of this process that listens at the robot, on a port that is free there."""
+        """A socket of this process that listens on the robot, on a port that is free there."""
         ours, theirs = socket.socketpair()
         with ours, theirs:
             subprocess.run([*inside(self.robot), sys.executable, '-c', LISTEN, ROBOT], stdin=theirs, check=True)
@@ -81,7 +81,7 @@ class Machines:
         return socket.socket(fileno=descriptor)
 
     def start(self, *arguments: str, other: bool = False) -> subprocess.Popen[str]:
-        """finding.py there; returns once it is ready."""
+        """Start finding.py there; returns once it is ready."""
         command = [*inside(self.other if other else self.robot), sys.executable, str(HERE / 'finding.py'), *arguments]
         path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get('PYTHONPATH')])])
         own = ('CYCLONEDDS_', 'ROS_LOCALHOST', 'ROS_AUTO', 'ROS_STATIC', 'RMW_', 'FASTDDS_', 'FASTRTPS_')
@@ -91,7 +91,7 @@ class Machines:
         return process
 
     def _hold(self, command: Sequence[str]) -> int:
-        """A process that is there; its number, which unshare and nsenter keep."""
+        """The id of a sleeping process that keeps the namespaces of unshare and nsenter."""
         holder = subprocess.Popen([*command, 'sh', '-c', 'echo there; exec cat'], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                                   stderr=subprocess.PIPE, text=True)  # fmt: skip
         self._stack.callback(_end, holder)
@@ -108,7 +108,7 @@ class Machines:
 
 
 def inside(pid: int) -> list[str]:
-    """What a command begins with that runs in the network of that process."""
+    """The prefix of a command that runs in the network of that process."""
     user = [] if os.geteuid() == 0 else ['--user', '--preserve-credentials']
     return ['nsenter', '--target', str(pid), *user, '--net']
 

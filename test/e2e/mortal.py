@@ -1,7 +1,7 @@
-"""Lets the node's threads die on order: copied as sitecustomize.py to where a Python finds it at its start.
+"""Makes the node's threads crash on request: copied as sitecustomize.py to a folder on Python's path.
 
 A file ``NAME.round`` in the folder ORDERS makes the next round of that worker raise SystemExit, ``NAME.thread`` ends its thread
-for good. The file's new name ends in ``.done``, and it holds the boot clock of that moment, ns. ``main.round`` is the main loop.
+permanently. The file is renamed to ``.done``, and contains the boot clock of that moment in ns. ``main.round`` is the main loop.
 """
 
 import os
@@ -18,7 +18,7 @@ make, tick = Worker.__init__, Pipeline.tick
 
 
 def obey(name: str) -> str | None:
-    """How to die now, if so."""
+    """The requested crash, if any."""
     for way in ('round', 'thread'):
         order = orders / f'{name}.{way}'
         if order.exists():

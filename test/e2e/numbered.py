@@ -1,4 +1,4 @@
-"""Strings with a publisher's name and a number of its own, published in the background until somebody says stop. Knows no DDS."""
+"""Strings with a publisher's name and a sequence number, published in the background until stopped. Does not depend on DDS."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def message(name: str, number: int, size: int) -> bytes:
-    """A std_msgs/String in CDR: ``name:number:``, filled up to so many bytes."""
+    """A std_msgs/String in CDR: ``name:number:``, padded to this size."""
     text = f'{name}:{number}:'.ljust(size).encode() + b'\0'
     return b'\0\1\0\0' + struct.pack('<I', len(text)) + text
 
@@ -24,9 +24,9 @@ def parse_numbered(text: str) -> tuple[str, int]:
 
 
 class Numbered:
-    """One thread a topic; who is late catches up. Numbers of a topic go on where they were when it is begun again.
+    """One thread per topic; late ones catch up. The numbers of a topic continue when it is started again.
 
-    ``write`` raises TimeoutError for a message that it did not send: that one is tried again, and it is sent once.
+    ``write`` raises TimeoutError for a message that it did not send: that message is retried, and sent once.
     """
 
     def __init__(self, write: Callable[[str, bytes], None]) -> None:
@@ -37,11 +37,11 @@ class Numbered:
 
     @staticmethod
     def takes(order: Mapping[str, Any]) -> bool:
-        """Whether such an order is for it."""
+        """Whether it handles this command."""
         return order['do'] in {'begin_numbered', 'halt_numbered', 'pauses_numbered'}
 
     def obey(self, order: Mapping[str, Any]) -> int | list[tuple[int, int]] | None:
-        """How many were sent, where no more are; or when nothing was sent for longer than asked, wall clock in ns."""
+        """The number sent, when stopping; or the pauses longer than requested, wall clock in ns."""
         if order['do'] == 'pauses_numbered':
             return [pair for pair in pairwise(self._times[order['topic']]) if pair[1] - pair[0] > order['longer_ns']]
         if order['do'] == 'halt_numbered':

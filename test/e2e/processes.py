@@ -1,4 +1,4 @@
-"""Processes of the tests: the node, the simulated robot, a witness and publishers, each on its own and always reaped."""
+"""Processes of the tests: the node, the simulated robot, a witness and publishers, each separate and always reaped."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ NODE = 'shadowhound_data_logger.node.sensor_logger_node'
 SIM = 'shadowhound_sim.sim_go2_node'
 COMMANDS = 'shadowhound_data_logger.cli.main'
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
-"""``SHADOWHOUND_TEST_LONG=1 make test PYTEST_ARGS=test/e2e`` runs the minutes that are promised, instead of seconds."""
+"""``SHADOWHOUND_TEST_LONG=1 make test PYTEST_ARGS=test/e2e`` runs for the documented minutes instead of seconds."""
 WAIT_S = 120.0
-"""Longer than anything takes that works, on a machine that does other things as well; a node starts in two when it is idle."""
+"""Longer than any working operation takes on a busy machine; a node starts in two seconds on an idle one."""
 GENTLE = 'rate_scale:=0.3'
-"""Of a simulated Go2, for tests that are not about its rates: it and the node cost a third."""
+"""Of a simulated Go2, for tests that do not depend on its rates: it and the node use a third of the CPU."""
 UNHEARD = 3
-"""So many messages a publisher may have sent before a node on a busy machine knows of it, RELIABLE or not: an account begins with
-the first that was taken (docs/reliability.md)."""
+"""The number of messages that a publisher may have sent before a node on a busy machine discovers it, RELIABLE or not: an account
+starts with the first message received (docs/reliability.md).
+"""
 T = TypeVar('T')
 
 
 def until(condition: Callable[[], T], what: str | Callable[[], str], seconds: float = WAIT_S) -> T:
-    """The first true answer of ``condition``; fails with ``what`` it waited for when that takes too long."""
+    """The first true result of ``condition``; after a timeout the test fails with ``what`` it waited for."""
     end = time.monotonic() + seconds
     while not (answer := condition()):
         assert time.monotonic() < end, f'within {seconds:g} s: {what if isinstance(what, str) else what()}'
@@ -43,7 +44,7 @@ def until(condition: Callable[[], T], what: str | Callable[[], str], seconds: fl
 
 
 class Process:
-    """A program of Python whose standard error (and output, unless that is piped) goes to a log file."""
+    """A Python program with standard error (and output, unless piped) going to a log file."""
 
     def __init__(
         self, name: str, command: Sequence[str], log: Path, environ: Mapping[str, str], *,
@@ -66,7 +67,7 @@ class Process:
         return self.log_path.read_text(encoding='utf-8', errors='replace')
 
     def await_log(self, words: str, seconds: float = WAIT_S) -> None:
-        """Wait until the words are in the log."""
+        """Wait until the log contains the text."""
 
         def looked() -> bool:
             assert words in self.log or self.popen.poll() is None, f'{self.name} ended with {self.popen.returncode}: {self.log}'
@@ -81,7 +82,7 @@ class Process:
         return self.popen.wait(seconds)
 
     def kill(self) -> None:
-        """End it at once; idempotent."""
+        """Kill it; idempotent."""
         self.popen.kill()
         self.popen.wait()
         for stream in (self.popen.stdin, self.popen.stdout):
@@ -97,26 +98,26 @@ class Node(Process):
 
     @property
     def hears_numbers(self) -> bool:
-        """Whether it listens through a middleware that numbers messages: what is missed is known exactly then."""
+        """Whether its middleware numbers messages: only then is missed known exactly."""
         return 'listening by rmw_fastrtps' in self.log
 
     @property
     def is_beside(self) -> bool:
-        """Whether the robot speaks another RMW: what is published comes through UDP then, which may lose large messages."""
+        """Whether the robot uses another RMW: messages then arrive over UDP, which may lose large ones."""
         return "(the robot's is " in self.log
 
     def known(self, count: int) -> int | None:
-        """As the ledger tells a figure that only numbers let it know: None without them."""
+        """The ledger's value of a number that needs sequence numbers: None without them."""
         return count if self.hears_numbers else None
 
     def ledger(self) -> Mapping[str, Any]:
-        """As ``shadowhound-data ledger --json`` prints it; it balances at any time."""
+        """The output of ``shadowhound-data ledger --json``; it balances at any time."""
         found = ledger.read(self.home / 'spool', self.robot)
         assert ledger.imbalances(found) == []
         return found
 
     def topic(self, name: str) -> dict[str, Any]:
-        """The topic's row of the ledger; empty before there is one."""
+        """The topic's row of the ledger; empty until it exists."""
         row: dict[str, Any] = self.ledger()['topics'].get(name, {})
         return row
 
@@ -129,7 +130,7 @@ class Node(Process):
         )
 
     def settled(self, name: str, count: int, seconds: float = WAIT_S) -> dict[str, Any]:
-        """Wait until so many of the topic are received and none of them is open or waits for delivery; its row."""
+        """Wait until this many of the topic are received and none is open or pending; its row."""
 
         def done() -> bool:
             row = self.topic(name)
@@ -139,7 +140,7 @@ class Node(Process):
         return self.topic(name)
 
     def delivered(self, at_least: int = 1, seconds: float = WAIT_S) -> None:
-        """Wait until so many objects are delivered and none waits."""
+        """Wait until this many objects are delivered and none is pending."""
 
         def done() -> bool:
             objects = self.ledger()['objects']
@@ -148,37 +149,37 @@ class Node(Process):
         until(done, lambda: f'{at_least} objects delivered: {self.ledger()["objects"]}', seconds)
 
     def stop(self, number: int = signal.SIGINT, seconds: float = WAIT_S) -> dict[str, Any]:
-        """Ask it to end, and see that it does so with exit code 0; its last ledger."""
+        """Stop it, and check that it exits with code 0; its last ledger."""
         self.signal(number)
         assert self.wait(seconds) == 0, self.log
         return self.ledger()
 
 
 class Publisher(Process):
-    """A process with publishers of its own (publisher.py, or cyclone_driver.py), told what to do line by line."""
+    """A process with publishers (publisher.py, or cyclone_driver.py), controlled line by line."""
 
     def create(self, topic: str, type_name: str, *, reliable: bool = True, latched: bool = False, depth: int = 1000) -> None:
-        """A publisher by the name of its topic."""
+        """A publisher named after its topic."""
         self._tell(do='create', topic=topic, type=type_name, reliable=reliable, latched=latched, depth=depth)
 
     def matched(self, topic: str, count: int = 1) -> None:
-        """Wait until so many listen."""
+        """Wait until it has this many subscriptions."""
         self._tell(do='matched', topic=topic, count=count)
 
     def listen(self, topic: str, type_name: str, *, reliable: bool = True, depth: int = 1000) -> None:
-        """A reader beside it, of a Cyclone DDS driver."""
+        """A reader in the same process, of a Cyclone DDS driver."""
         self._tell(do='listen', topic=topic, type=type_name, reliable=reliable, latched=False, depth=depth)
 
     def count(self, topic: str) -> int:
-        """What its reader has received."""
+        """The messages received by its reader."""
         return int(self._tell(do='count', topic=topic))
 
     def publish(self, topic: str, messages: Iterable[bytes], period_s: float = 0.002) -> None:
-        """Serialized messages; returns when the last one is out."""
+        """Publish serialized messages; returns when the last one is sent."""
         self._tell(do='publish', topic=topic, messages=[message.hex() for message in messages], period_s=period_s)
 
     def again(self, topic: str, message: bytes, count: int, period_s: float) -> None:
-        """The same message so many times; returns when the last one is out."""
+        """Publish the same message this many times; returns when the last one is sent."""
         self._tell(do='again', topic=topic, message=message.hex(), count=count, period_s=period_s)
 
     def begin(self, topic: str, type_name: str, period_s: float, size: int = 0) -> None:
@@ -189,19 +190,19 @@ class Publisher(Process):
         self._tell(do='halt', topic=topic)
 
     def begin_numbered(self, topic: str, name: str, size: int, period_s: float) -> None:
-        """Publish Strings with that name and a number each (numbered.py) from now on, in the background."""
+        """Publish Strings with that name and sequence numbers (numbered.py) from now on, in the background."""
         self._tell(do='begin_numbered', topic=topic, name=name, size=size, period_s=period_s)
 
     def halt_numbered(self, topic: str) -> int:
-        """No more of them; how many were sent."""
+        """Stop them; returns how many were sent."""
         return int(self._tell(do='halt_numbered', topic=topic))
 
     def pauses_numbered(self, topic: str, longer_ns: int) -> list[tuple[int, int]]:
-        """When it sent none of them for longer than that: from one to the next, wall clock in ns."""
+        """Pauses longer than that between two of them, wall clock in ns."""
         return [(begin, end) for begin, end in json.loads(self._tell(do='pauses_numbered', topic=topic, longer_ns=longer_ns))]
 
     def heard(self, topic: str, node: Node, message: bytes) -> None:
-        """Publish the message until the node received it, so that whatever follows comes after the match."""
+        """Publish the message until the node received it, so that whatever follows is published after the match."""
         self.matched(topic)
         before = node.topic(topic).get('received', 0)
 
@@ -209,19 +210,19 @@ class Publisher(Process):
             self.publish(topic, [message], 0.0)
             return bool(node.topic(topic).get('received', 0) > before)
 
-        until(received, f'{topic} is heard')
+        until(received, f'{topic} is received')
 
     def destroy(self, topic: str) -> None:
-        """At once: what has to arrive must have been received before."""
+        """Destroy it immediately: wait for messages that must arrive first."""
         self._tell(do='destroy', topic=topic)
 
     def end(self) -> None:
-        """It leaves as a node should, so that the others know at once; what has to arrive must have been received before."""
+        """Leave the graph properly, so that others notice immediately; wait for messages that must arrive first."""
         self._tell(do='end')
         assert self.wait() == 0, self.log
 
     def _tell(self, **order: object) -> str:
-        """What it answers beyond that it is done."""
+        """Send a command; returns its response without ``done``."""
         assert self.popen.stdin is not None
         assert self.popen.stdout is not None
         self.popen.stdin.write(json.dumps(order) + '\n')
@@ -232,7 +233,7 @@ class Publisher(Process):
 
 
 class Processes:
-    """All that a test starts. ``end`` reaps what still runs. What can be is ``forked``, which is quicker (forking.py)."""
+    """All processes that a test starts. ``end`` reaps those still running. Most are ``forked``, which is faster (forking.py)."""
 
     def __init__(self, folder: Path, domain: int, robot: str, *, forked: bool = False) -> None:
         self.folder, self.robot, self._forked = folder, robot, forked
@@ -248,7 +249,7 @@ class Processes:
         ready: bool = True, robot: str | None = None, home: str = 'home', environ: Mapping[str, str] | None = None,
         program: Sequence[str] = ('-m', NODE),
     ) -> Node:  # fmt: skip
-        """The logger: ``store`` is the environment that names one, ``parameters`` are flat ROS names."""
+        """The logger: ``store`` has the environment variables of the store, ``parameters`` are flat ROS names."""
         name = self._name('node')
         file = self.folder / f'{name}.yaml'
         given = {'spool.min_free_bytes': 0, **(parameters or {})}
@@ -265,7 +266,7 @@ class Processes:
         return node
 
     def sim(self, *parameters: str, namespace: str = '/') -> Process:
-        """The simulated Go2; ``published`` has what it said at its end."""
+        """The simulated Go2; ``published`` has its final counts."""
         given = [word for parameter in parameters for word in ('-p', parameter)]
         name = self._name('sim')
         command = ['-m', SIM, '--ros-args', '-r', f'__ns:={namespace}', *given]
@@ -275,7 +276,7 @@ class Processes:
         self, node: Node, *arguments: str, port: int = 0, program: Sequence[str] = ('-m', COMMANDS),
         environ: Mapping[str, str] | None = None,
     ) -> tuple[Process, str]:  # fmt: skip
-        """The live page of what this node logs, and its address."""
+        """The live page of this node's data, and its address."""
         name = self._name('live')
         own = {'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
         environ = {**self.environ, **own, **(environ or {})}
@@ -286,7 +287,7 @@ class Processes:
         return page, json.loads(said[said.index('{') : said.rindex('}') + 1])['url']
 
     def witness(self, topics: Mapping[str, str], output: Path, *, best_effort: Iterable[str] = ()) -> Process:
-        """A second listener that writes all it hears, as it came, to a file (witness.py); SIGTERM ends it."""
+        """A second subscriber that writes everything it receives, unchanged, to a file (witness.py); SIGTERM stops it."""
         order = json.dumps({topic: [type_name, topic not in best_effort] for topic, type_name in topics.items()})
         name = self._name('witness')
         command = [str(HERE / 'witness.py'), str(output), order]
@@ -323,12 +324,12 @@ class Processes:
 
 
 def is_accounted(told: int | None, counted: int) -> bool:
-    """Whether a ledger knows of all that a robot published, but for what it sent before the node knew of it."""
+    """Whether a ledger includes everything that a robot published, except what it sent before the node discovered it."""
     return told is None or 0 <= counted - told <= UNHEARD
 
 
 def published(sim: Process, seconds: float = WAIT_S) -> dict[str, int]:
-    """Wait for the end of a simulated Go2; topic -> messages, as it counted them itself."""
+    """Wait for the end of a simulated Go2; topic -> messages, counted by the robot."""
     assert sim.wait(seconds) == 0, sim.log
     line = next(line for line in reversed(sim.log.splitlines()) if line.startswith('{"published"'))
     counts: dict[str, int] = json.loads(line)['published']

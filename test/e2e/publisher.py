@@ -1,4 +1,4 @@
-"""Program of a test: publishers that do what standard input says, one JSON object a line, each answered with ``done``."""
+"""Program of a test: publishers controlled by standard input, one JSON object per line, each followed by ``done``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 
 MATCH_S = 120.0
 ends: dict[str, threading.Event] = {}
-"""By topics that are published evenly."""
+"""Topics that are published evenly."""
 
 
 def profile(order: dict[str, Any]) -> QoSProfile:
@@ -44,7 +44,7 @@ def obey(order: dict[str, Any], node: Node, publishers: dict[str, Any]) -> None:
             end = time.monotonic() + MATCH_S
             while publishers[topic].get_subscription_count() < order['count']:
                 if time.monotonic() > end:
-                    raise TimeoutError(f'nobody listens to {topic}')
+                    raise TimeoutError(f'no subscription to {topic}')
                 time.sleep(0.005)
         case 'publish':
             due = time.monotonic()
@@ -70,7 +70,7 @@ def obey(order: dict[str, Any], node: Node, publishers: dict[str, Any]) -> None:
 
 
 def publish_evenly(publisher: Any, kind: Any, period_s: float, size: int, stopped: threading.Event) -> None:
-    """Numbers from 0 on, as text of a size; one that is late does not delay the next."""
+    """Numbers from 0 on, as text of a given size; a late message does not delay the next."""
     due = time.monotonic()
     number = 0
     while not stopped.wait(max(0.0, due - time.monotonic())):

@@ -1,9 +1,9 @@
-"""Writes down what there is in a source tree of rclpy: names of modules, functions, classes and their members, nothing else.
+"""Lists the contents of a source tree of rclpy: names of modules, functions, classes and their members, nothing else.
 
     python test/e2e/rclpy_names.py TREE COMMIT > test/e2e/rclpy_humble.json
 
-TREE is the folder with rclpy's ``package.xml``, ``rclpy/`` and ``src/``. ``humble.py`` hides what is not in the list, so that
-tests on a newer rclpy find what Humble's lacks.
+TREE is the folder with rclpy's ``package.xml``, ``rclpy/`` and ``src/``. ``humble.py`` hides names that are not in the list, so
+that tests on a newer rclpy find uses of anything that Humble lacks.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _BOUND = re.compile(
     r'|(?P<module>\b(?:m|module))\s*\.\s*(?:def|attr)\(\s*"(?P<function>\w+)"'
     r'|\.(?:def\w*|value)\(\s*"(?P<member>\w+)"'
 )
-"""In the order of a file: a bound class, something of the module itself, and a member of the class before it."""
+"""In the order of a file: a bound class, a name of the module itself, and a member of the preceding class."""
 _INFO = re.compile(r'"(\w+)"_a')
 _VERSION = re.compile(r'<version>([^<]+)</version>')
 
 
 def main(tree: Path, commit: str) -> dict[str, Any]:
-    """Everything of a tree."""
+    """All names of a tree."""
     modules = {name: module(ast.parse(path.read_text(encoding='utf-8'))) for name, path in sources(tree)}
     version = _VERSION.search((tree / 'package.xml').read_text(encoding='utf-8'))
     assert version is not None, f'{tree} has no package.xml with a version'
@@ -46,12 +46,12 @@ def sources(tree: Path) -> Iterator[tuple[str, Path]]:
 
 
 def message_info(tree: Path) -> list[str]:
-    """What a take tells of a message."""
+    """The fields of the message info that a take returns."""
     return sorted(_INFO.findall((tree / 'src/rclpy/subscription.cpp').read_text(encoding='utf-8')))
 
 
 def module(parsed: ast.Module) -> dict[str, Any]:
-    """Names of a module, and of its classes the bases and members."""
+    """The names of a module, and the bases and members of its classes."""
     classes = [node for node in ast.walk(parsed) if isinstance(node, ast.ClassDef)]
     return {
         'names': sorted(set(bound(parsed.body))),
@@ -62,7 +62,7 @@ def module(parsed: ast.Module) -> dict[str, Any]:
 
 
 def bound(body: Iterable[ast.stmt]) -> Iterator[str]:
-    """What statements bind, those in a branch included; what only type checkers see is not there."""
+    """The names that statements bind, including those in branches; not those for type checkers only."""
     for node in body:
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
             yield node.name
@@ -81,7 +81,7 @@ def bound(body: Iterable[ast.stmt]) -> Iterator[str]:
 
 
 def members(node: ast.ClassDef) -> Iterator[str]:
-    """What a class binds, and what its methods put into ``self``."""
+    """The names that a class binds, and the attributes that its methods set on ``self``."""
     yield from bound(node.body)
     for found in ast.walk(node):
         if isinstance(found, ast.Attribute) and isinstance(found.ctx, ast.Store) and last_name(found.value) == 'self':
@@ -99,7 +99,7 @@ def last_name(node: ast.expr) -> str:
 
 
 def compiled(paths: Iterable[Path]) -> dict[str, Any]:
-    """Names of the module that is written in C++."""
+    """The names of the module written in C++."""
     names: set[str] = set()
     classes: dict[str, dict[str, list[str]]] = {}
     for path in sorted(paths):

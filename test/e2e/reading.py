@@ -1,4 +1,4 @@
-"""Stored objects and recorded messages, read by other means than those that wrote them."""
+"""Stored objects and recorded messages, read by libraries other than those that wrote them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ TYPES = {
     '/joint_states': 'sensor_msgs/msg/JointState',
     '/lowstate': 'go2_interfaces/msg/LowState',
 }
-"""Those of the default profile."""
+"""The sensors of the default profile."""
 STRING = 'std_msgs/msg/String'
 
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """What the store holds of one robot (or below ``robot/sensor``), but for bookkeeping, as ledger and catalog."""
+    """The stored objects of one robot (or below ``robot/sensor``), except housekeeping such as ledger and catalog."""
 
     contents: Mapping[str, bytes]
     """Key -> content."""
@@ -45,7 +45,7 @@ class Objects:
         return cls({key: store.get(bucket, key) for key in keys}, {key: info for key, info in infos.items() if info})
 
     def without(self, prefix: str) -> Objects:
-        """The others."""
+        """The objects not under these sensors."""
         keys = [key for key in self.contents if not key.startswith(prefix)]
         return Objects({key: self.contents[key] for key in keys}, {key: self.infos[key] for key in keys if key in self.infos})
 
@@ -69,7 +69,7 @@ class Objects:
         return sorted(int(text) for text in data if text.isdigit())
 
     def counted(self) -> Counter[str]:
-        """Topic -> samples, as the objects say of themselves."""
+        """Topic -> samples, according to the objects' metadata."""
         counts: Counter[str] = Counter()
         for info in self.infos.values():
             counts[info.metadata['topic']] += int(info.metadata['count'])
@@ -82,7 +82,7 @@ def message_class(type_name: str) -> Any:
 
 
 def decode(type_name: str, cdr: bytes) -> Any:
-    """By rclpy, not by the library that the encoders use."""
+    """By rclpy, not by the encoders' library."""
     return deserialize_message(cdr, message_class(type_name))
 
 
@@ -100,7 +100,7 @@ def stamp_ns(message: Any) -> int:
 
 
 def assert_same(recorded: Any, value: Any, kind: str, where: str = '') -> None:
-    """A JSON value is the message's value of a ROS type, floats bit for bit."""
+    """A JSON value equals the message's value of a ROS type, floats bit for bit."""
     if kind.startswith('sequence<uint8'):
         assert base64.b64decode(recorded) == bytes(value), where
     elif kind.endswith(']') or kind.startswith('sequence<'):

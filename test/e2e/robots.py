@@ -1,4 +1,4 @@
-"""Robots of other vendors with content that can be looked at, and the logger and its page next to them."""
+"""Robots of other vendors with visible content, and the logger and its page next to them."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ class Sent(NamedTuple):
 
     type: str
     fields: Mapping[str, Any] | Callable[[int], Mapping[str, Any]] = MappingProxyType({})
-    """Of each message, or of that of a round; its frame is in them as ``header.frame_id``."""
+    """Fields of each message, or of a round's; its frame is in ``header.frame_id``."""
     every: int = 1
-    """Rounds from one message to the next; 0: once, latched."""
+    """Rounds between two messages; 0: once, latched."""
     sensor: str = ''
-    """Of the logger; empty where it is not logged."""
+    """The logger's sensor; empty if the topic is not logged."""
 
 
 def message(type_name: str, fields: Mapping[str, Any]) -> Any:
-    """With these fields, by the names of their paths; all others are zero or empty."""
+    """A message with these fields, by path; all others are zero or empty."""
     made = _zero(type_name)
     for path, value in fields.items():
         *owners, last = path.split('.')
@@ -86,7 +86,7 @@ def _zero(type_name: str) -> Any:
 
 
 class Robot:
-    """A robot with some topics, and the logger beside it."""
+    """A robot with some topics, and the logger next to it."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class Robot:
         mission: str = '',
         cyclone: bool = False,
     ) -> None:
-        """``mission``: the robot's name in the mission that it walks; empty: it walks without one."""
+        """``mission``: the robot's name in the mission that it walks; empty: no mission."""
         self._processes, self._is_cyclone = processes, cyclone
         self.name = robot or mission
         self.topics = topics if cyclone else {topic: sent for topic, sent in topics.items() if find_spec(sent.type.split('/')[0])}
@@ -134,7 +134,7 @@ class Robot:
 
     @contextmanager
     def walking(self) -> Iterator[None]:
-        """It walks on."""
+        """Continue walking."""
         ended = threading.Event()
 
         def walk() -> None:
@@ -150,7 +150,7 @@ class Robot:
             walker.join()
 
     def page(self) -> str:
-        """The address of its live page. One that does not speak the robot's Cyclone DDS finds it by the same peers."""
+        """The address of its live page. If it does not use the robot's Cyclone DDS it has the same peers."""
         environ: dict[str, str] = {}
         if self._is_cyclone:
             path, variables = self.node.home / 'fastdds.xml', self._processes.environ
@@ -160,9 +160,9 @@ class Robot:
         return self._processes.page(self.node, environ=environ)[1]
 
     def shown(self, browser: Browser, *panels: str, drawn: Iterable[str]) -> Page:
-        """Its live page, where it is seen to be complete: each topic in the table, and in these panels what can be drawn.
+        """Its live page, checked for completeness: each topic in the table, and drawable data in these panels.
 
-        ``drawn`` are the kinds of items that the page received. Nothing fails in the browser, and all of it fits on a phone.
+        ``drawn`` are the kinds of items that the page received. The browser reports no errors, and everything fits on a phone.
         """
         page = opened(browser, self.page())
         for topic, each in self.topics.items():
@@ -187,7 +187,7 @@ class Robot:
         return page
 
     def fetched(self, folder: Path) -> None:
-        """Each object that ``query`` names is a file of ``fetch``, and there is one of each sensor at least."""
+        """Each object from ``query`` is a file of ``fetch``, and there is at least one of each sensor."""
         flags = ('--robot', self.name)
         rows = self.ask('query', *flags)
         self.ask('fetch', *flags, '--to', str(folder))
@@ -212,7 +212,7 @@ class Robot:
         return ledger
 
     def export(self, folder: Path, config: Mapping[str, Any] | Path) -> dict[str, Any]:
-        """The features of a dataset of the mission, in ``folder``; it has a frame for each period of its length."""
+        """The features of a dataset of the mission, in ``folder``; it has a frame for each period of its duration."""
         path = config if isinstance(config, Path) else folder.with_suffix('.yaml')
         if not isinstance(config, Path):
             path.write_text(json.dumps(config))
@@ -223,13 +223,13 @@ class Robot:
         return dict(info['features'])
 
     def refused(self, *arguments: str) -> str:
-        """What a verb says that fails."""
+        """The output of a command that fails."""
         ran = self._run(*arguments)
         assert ran.returncode, ran.stdout
         return ran.stdout + ran.stderr
 
     def ask(self, *arguments: str) -> Any:
-        """The JSON of a verb, about the folder that is the store."""
+        """The JSON output of a command, with the folder as the store."""
         ran = self._run(*arguments, '--json')
         assert ran.returncode == 0, ran.stdout + ran.stderr
         return json.loads(ran.stdout)
@@ -243,11 +243,11 @@ class Robot:
 # -- what they publish -----------------------------------------------------------------------------------------------------------
 
 ROOM = 6.0, 4.0
-"""From its middle to its walls, in meters."""
+"""From its center to its walls, in meters."""
 
 
 def made(type_name: str, **fields: Any) -> Any:
-    """A message in a message; ``__`` in a name is the dot of a path."""
+    """A nested message; ``__`` in a name is the dot of a path."""
     return message(type_name, {name.replace('__', '.'): value for name, value in fields.items()})
 
 
@@ -256,7 +256,7 @@ def _yaw(angle: float, prefix: str = 'pose.pose.orientation') -> dict[str, float
 
 
 def _place(number: int) -> tuple[float, float, float]:
-    """On an ellipse: x, y and where it looks."""
+    """On an ellipse: x, y and heading."""
     turn = number * 0.02
     return 3 * math.cos(turn), 2 * math.sin(turn), math.atan2(2 * math.cos(turn), -3 * math.sin(turn))
 
@@ -434,7 +434,7 @@ ARM: Mapping[str, Sent] = {
 
 
 def unitree(*, has_package: bool) -> Mapping[str, Sent]:
-    """Its own topics; those of ``unitree_go`` are logged where that package is installed."""
+    """Its vendor topics; those of ``unitree_go`` are logged if that package is installed."""
     names = iter(('lowstate', 'states', 'wirelesscontroller', 'frontvideostream') if has_package else [''] * 4)
     return {
         '/utlidar/cloud': Sent('sensor_msgs/msg/PointCloud2', _cloud('odom'), 1, 'lidar'),

@@ -1,4 +1,4 @@
-"""One run of the simulated Go2 whose sensors, bags and catalog several files of tests look at."""
+"""One run of the simulated Go2 with sensors, bags and a catalog that are checked in several files of tests."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Robot, witness and a node with the default settings that records from its start on; all of them have ended."""
+    """Robot, witness and a node with the default settings that records from its start on; all of them have stopped."""
 
     node: Node
     folder: Path
     robot: str
     said: dict[str, int]
-    """Topic -> messages, as the robot counted them; without those of BEST_EFFORT that nobody knew of yet."""
+    """Topic -> messages, as counted by the robot; without BEST_EFFORT messages sent before it was discovered."""
     ledger: dict[str, Any]
     ended_ns: int
-    """When the node had ended."""
+    """When the node stopped."""
     heard: dict[str, list[Heard]]
-    """By the witness, in order."""
+    """Recorded by the witness, in order."""
     by_stamp: dict[str, dict[int, Heard]]
-    """The same by stamp, which is the header's, else the publisher's."""
+    """The same by stamp, from the header or otherwise from the publisher."""
     objects: Objects
     """Of the sensors."""
     bag: Bag

@@ -1,4 +1,4 @@
-"""An operator of a running node by ROS's own means: services, parameters and ``/diagnostics``."""
+"""An operator that uses a running node through ROS: services, parameters and ``/diagnostics``."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from std_srvs.srv import SetBool, Trigger
 
 NODE = '/sensor_logger_node'
 ASK_S = WAIT_S / 3
-"""After which a request is sent again. A client that the server has not discovered yet may never be answered: services of ROS are
-pairs of topics, and neither rmw_fastrtps nor rmw_cyclonedds tells a client that the server knows both of its own."""
+"""After this time a request is sent again. A client that the server has not discovered yet may never get a response: ROS services
+are pairs of topics, and neither rmw_fastrtps nor rmw_cyclonedds tells a client that the server has discovered both of its own.
+"""
 
 
 class Station:
-    """New with the environment of the node's processes, and the namespace of the one that is meant; close once."""
+    """Uses the environment of the node's processes, and the namespace of the intended node; close once."""
 
     def __init__(self, environ: Mapping[str, str], namespace: str = '') -> None:
         self._name = namespace + NODE
@@ -40,38 +41,38 @@ class Station:
         rclpy.shutdown(context=self._context)
 
     def spin(self) -> None:
-        """Hear what there is to hear."""
+        """Handle pending messages."""
         self._executor.spin_once(timeout_sec=0.1)
 
     def flush(self) -> str:
-        """What ``~/flush`` answers; it must succeed."""
+        """The response of ``~/flush``; it must succeed."""
         answer = self.call(Trigger, '/flush', Trigger.Request())
         assert answer.success, answer.message
         return str(answer.message)
 
     def pause(self, *, paused: bool) -> str:
-        """What ``~/pause`` answers; it must succeed."""
+        """The response of ``~/pause``; it must succeed."""
         answer = self.call(SetBool, '/pause', SetBool.Request(data=paused))
         assert answer.success, answer.message
         return str(answer.message)
 
     def bag(self, what: str) -> tuple[bool, str]:
-        """What ``~/bag/start``, ``stop`` or ``split`` answers."""
+        """The response of ``~/bag/start``, ``stop`` or ``split``."""
         answer = self.call(Trigger, f'/bag/{what}', Trigger.Request())
         return bool(answer.success), str(answer.message)
 
     def bag_pause(self, *, paused: bool) -> tuple[bool, str]:
-        """What ``~/bag/pause`` answers."""
+        """The response of ``~/bag/pause``."""
         answer = self.call(SetBool, '/bag/pause', SetBool.Request(data=paused))
         return bool(answer.success), str(answer.message)
 
     def event(self) -> tuple[bool, str]:
-        """What ``~/event/trigger`` answers."""
+        """The response of ``~/event/trigger``."""
         answer = self.call(Trigger, '/event/trigger', Trigger.Request())
         return bool(answer.success), str(answer.message)
 
     def set(self, **values: Any) -> str:
-        """Set parameters (``sensor__name``) together; why they were refused, empty where they were not."""
+        """Set parameters (``sensor__name``) together; returns the reason if they were refused, otherwise an empty string."""
         parameters = [Parameter(name.replace('__', '.'), value=value).to_parameter_msg() for name, value in values.items()]
         answer = self.call(SetParametersAtomically, '/set_parameters_atomically',
                             SetParametersAtomically.Request(parameters=parameters))  # fmt: skip
@@ -96,18 +97,18 @@ class Station:
         return {entry.name: entry for entry in heard[0].status}
 
     def answers(self, seconds: float) -> bool:
-        """Whether ``~/flush`` answers in that time. While a server that was killed is still known, a call may go to it alone."""
+        """Whether ``~/flush`` responds in that time. A call may still be sent to a killed server in the graph."""
         return self._ask(Trigger, '/flush', Trigger.Request(), seconds) is not None
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
-        """The answer of one of the node's services."""
+        """The response of one of the node's services."""
         tries = round(WAIT_S / ASK_S)
         answer = next((answer for _ in range(tries) if (answer := self._ask(kind, name, request, ASK_S)) is not None), None)
         assert answer is not None, f'{self._name + name} does not answer'
         return answer
 
     def _ask(self, kind: Any, name: str, request: Any, seconds: float) -> Any:
-        """None where no answer comes in that time."""
+        """None without a response in that time."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, self._name + name)
         client = self._clients[name]

@@ -1,4 +1,4 @@
-"""A robot that is not ours, and a logger without any settings: every topic with a rule is stored by its type."""
+"""A robot of another vendor, and a logger without any settings: every topic with a rule is stored by its type."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ SENT: dict[str, tuple[Any, float, bool]] = {
     'robot_description': (String(data='<robot/>'), 0.0, True),
     'led': (ColorRGBA(), 5.0, False),
 }
-"""Topic -> a message, how often it is sent in Hz (0: once), and whether it is latched."""
+"""Topic -> a message, its rate in Hz (0: once), and whether it is latched."""
 LATE = 'camera/camera_info'
-"""A topic of a default sensor that is published once the node knows that the robot is not a Unitree."""
+"""A topic of a default sensor that is published once the node has found that the robot is not a Unitree."""
 STAMPED = {name for name, (message, _, _) in SENT.items() if hasattr(message, 'header')}
 
 
@@ -75,7 +75,7 @@ def node(shared: Processes, seaweed: Tower) -> Node:
 
 
 def test_everything_is_stored_by_its_type(node: Node, stored: Callable[..., Objects]) -> None:
-    """Each message is in the store or counted as left out by the rate, and the ledger balances."""
+    """Each message is in the store or counted as skipped by the rate, and the ledger balances."""
     for name, (_, rate_hz, _) in SENT.items():
         if name != 'led':
             sent = max(1, round(rate_hz * SECONDS))
@@ -104,12 +104,12 @@ def test_everything_is_stored_by_its_type(node: Node, stored: Callable[..., Obje
 
 
 def test_topics_without_a_rule_are_named(node: Node) -> None:
-    """In the log, and nothing of it is stored."""
+    """In the log, and none of their messages are stored."""
     assert f'{NS}/led (std_msgs/msg/ColorRGBA) is not logged: there is no rule for std_msgs/msg/ColorRGBA' in node.log
 
 
 def test_a_go2_is_known_when_its_driver_starts_late(processes: Processes) -> None:
-    """What another node published before does not make it another robot for good."""
+    """What another node published before does not permanently make it another robot."""
     early = processes.publisher()
     early.create('/joy', 'sensor_msgs/msg/Joy')
     node = processes.node()

@@ -1,6 +1,6 @@
-"""docs/ask.md: its commands, run one after the other on what a demo stored, succeed and print what the page shows the form of.
+"""The commands of docs/ask.md, run in order on the data of a demo, succeed with output in the documented form.
 
-``scripts/with-env python test/e2e/test_ask_page.py`` writes their answers on what ``make demo`` left in demo/ into the page.
+``scripts/with-env python test/e2e/test_ask_page.py`` updates the page with their output on the data of ``make demo`` in demo/.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from shadowhound_tower.embedded import Tower
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'ask.md'
 HOME = '/home/ann/.shadowhound'
-"""As the page has it."""
+"""As on the page."""
 MAX_LINES, FIRST_LINES = 9, 4
-"""Of a longer answer the first lines stand on the page, and what comes after its table."""
+"""The page has the first lines of a long output, and what follows its table."""
 COMMAND = '    $ '
 
 
 def commands(page: str) -> Iterator[tuple[int, int, str]]:
-    """Of each command the number of its line, that of the line after its answer, and the command."""
+    """For each command its line number, the number of the line after its output, and the command."""
     lines = page.splitlines()
     for number, line in enumerate(lines):
         if line.startswith(COMMAND):
@@ -38,7 +38,7 @@ def commands(page: str) -> Iterator[tuple[int, int, str]]:
 
 
 def answered(page: str, ask: Callable[[str], str]) -> str:
-    """The page with the answers of today."""
+    """The page with current outputs."""
     lines = page.splitlines()
     made: list[str] = []
     done = 0
@@ -57,7 +57,7 @@ def shortened(lines: list[str]) -> list[str]:
 
 
 def asking(tower: Tower, folder: Path) -> Callable[[str], str]:
-    """Runs a command as a user of a machine beside the Tower, in a folder and a home of its own."""
+    """Runs a command as a user of a machine in the Tower's network, in a separate folder and home."""
     environ = {**os.environ, **tower.environment(), 'SHADOWHOUND_HOME': str(folder / 'home'), 'COLUMNS': '150',
                'NO_PROXY': '127.0.0.1'}  # fmt: skip
 
@@ -76,7 +76,7 @@ def asking(tower: Tower, folder: Path) -> Callable[[str], str]:
 @pytest.mark.ros
 @pytest.mark.seaweedfs
 def test_the_commands_of_the_page_have_answers_of_the_form_that_it_shows(tmp_path: Path) -> None:
-    """Tables have the columns of the page, and no command fails, or says nothing where the page shows an answer."""
+    """Tables have the documented columns, and no command fails, or prints nothing if the page shows output."""
     pytest.importorskip('rclpy')
     pytest.importorskip('go2_interfaces')
     command = [sys.executable, '-m', 'shadowhound_sim.demo', '--duration', '20', '--outage', '0', '--folder', 'demo']
@@ -91,12 +91,12 @@ def test_the_commands_of_the_page_have_answers_of_the_form_that_it_shows(tmp_pat
         for command, lines in shown.items():
             answer = ask(command).split('\n')
             assert bool(lines) == bool(answer[0]), command
-            if lines and not re.search(r'\d', lines[0]) and answer[0][:8] != '0 times.':  # a third of a minute has less to tell
+            if lines and not re.search(r'\d', lines[0]) and answer[0][:8] != '0 times.':  # 20 seconds produce less output
                 assert answer[0].split() == lines[0].split(), command
 
 
 def main(demo: Path) -> None:
-    """Write the page anew."""
+    """Update the page."""
     with tempfile.TemporaryDirectory() as folder, Tower(demo / 'tower') as tower:
         PAGE.write_text(answered(PAGE.read_text(encoding='utf-8'), asking(tower, Path(folder))), encoding='utf-8')
 

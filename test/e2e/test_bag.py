@@ -1,4 +1,4 @@
-"""Bags recorded by the node: what was published is in them byte for byte, slices leave while the next one records."""
+"""Bags recorded by the node: published messages are in them byte for byte, slices are uploaded while the next one is recorded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.timeout(300 + 2 * DURATION_S)
 
 
 def test_the_bag_is_complete_in_every_reader(session: Session) -> None:
-    """mcap, rosbags, metadata.yaml and manifest.json agree on what is in it, and that nothing is missing."""
+    """mcap, rosbags, metadata.yaml and manifest.json agree on the contents, and nothing is missing."""
     assert session.bag.manifest['state'] == 'complete'
     assert session.bag.manifest['missing'] == []
     assert session.bag.check() == {topic: len(found) for topic, found in session.messages.items()}
@@ -33,8 +33,8 @@ def test_the_bag_is_complete_in_every_reader(session: Session) -> None:
 def test_every_message_is_in_the_bag_as_published(session: Session, topic: str) -> None:
     """Equal bytes in the same order, with the time of the header or of sending and, not before it, the time of arrival.
 
-    The first ones beside another RMW come in any order: one of the two subscriptions with which a node begins gets what was sent
-    before it knew the publisher, the other one meanwhile what is new.
+    The first ones on a robot with another RMW may be in any order: one of a new node's two subscriptions gets messages from
+    before it discovered the publisher, the other one new messages at the same time.
     """
     found, heard = session.messages[topic], session.heard[topic]
     decoded = [decode(TYPES[topic], message.cdr) for message in heard]
@@ -49,7 +49,7 @@ def test_every_message_is_in_the_bag_as_published(session: Session, topic: str) 
 
 
 def test_bags_are_a_separate_sink_in_the_ledger(session: Session) -> None:
-    """All that was published was recorded and delivered, whatever the sensors kept of it."""
+    """Everything published was recorded and delivered, whichever messages the sensors kept."""
     assert set(session.ledger['bags']) == set(TYPES)
     for topic, row in session.ledger['bags'].items():
         known, said = session.node.known, session.said[topic]
@@ -61,7 +61,7 @@ def test_bags_are_a_separate_sink_in_the_ledger(session: Session) -> None:
 
 
 def test_slices_are_delivered_while_the_next_one_records(session: Session, store: ObjectStore) -> None:
-    """The first is in the store before the last one begins, and carries what a listing has to know."""
+    """The first is in the store before the last one starts, with the metadata that a listing needs."""
     assert len(session.bag.slices) >= DURATION_S / SLICE_S * 0.8 - 1  # a slice ends with the first sync after its time
     first, last = session.bag.manifest['slices'][0], session.bag.manifest['slices'][-1]
     info = store.head(BUCKET, first['key'])
@@ -82,7 +82,7 @@ def _row(session: Session, key: str) -> dict[str, Any]:
 def test_the_services_start_pause_split_and_stop_a_bag(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:
-    """Of a topic that no sensor takes: what came between start and stop is in the bag but for the pause, in two slices."""
+    """For a topic without a sensor: messages between start and stop are in the bag except for the pause, in two slices."""
     node = processes.node(seaweed.environment(), {'bag.regex': '^/b_', 'bag.exclude': 'not', 'sensors': ['odom']})
     publisher = processes.publisher()
     for topic in ('/b_one', '/b_not'):
@@ -116,7 +116,7 @@ def test_the_services_start_pause_split_and_stop_a_bag(
 
 
 def test_a_bag_starts_with_latched_messages(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
-    """What a latched publisher sent before the recording is in the bag, once, though a sensor had taken it long ago."""
+    """A latched message from before the recording is in the bag, once, though a sensor received it long before."""
     parameters = {'sensors': ['map'], 'map.topics': ['/b_map'], 'map.rate_hz': 0.0}
     node = processes.node(seaweed.environment(), parameters)
     publisher = processes.publisher()
@@ -128,7 +128,7 @@ def test_a_bag_starts_with_latched_messages(processes: Processes, seaweed: Tower
     until(lambda: node.ledger()['bags'].get('/b_map', {}).get('received') == 1, 'what was latched is received')
     publisher.publish('/b_map', texts([2]))
     node.received('/b_map', 2)
-    until(lambda: node.ledger()['bags']['/b_map']['received'] == 2, 'what came later is received')
+    until(lambda: node.ledger()['bags']['/b_map']['received'] == 2, 'the later messages are received')
     assert station.bag('stop')[0]
     ledger = node.stop()
     (bag,) = bags(store, processes.robot, processes.folder / 'bags')

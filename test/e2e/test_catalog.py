@@ -1,4 +1,4 @@
-"""The catalog of a simulated robot: read by pyarrow, held against the bucket and against where the simulator says it was."""
+"""The catalog of a simulated robot: read by pyarrow, compared with the bucket and with the simulator's positions."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from shadowhound_data_logger.stores.s3 import S3Store
 SEED = 1
 ODOMETRY_HZ = 50
 START_S = 60
-"""The robot was started less than so long before its first odometry was stored."""
+"""The robot started less than this before its first odometry was stored."""
 NEAR_M = 0.1
 TURNED_RAD = 0.1
 TOLD_OTHERWISE = {'t_start', 't_end', 'content_type'}
-"""Times come as datetimes, and SeaweedFS guesses what an application/octet-stream is."""
+"""Times are datetimes, and SeaweedFS guesses the type of an application/octet-stream."""
 WITH_HEADER = ('camera', 'joints', 'lidar', 'odom')
-"""Whose objects have the pose of their header's time. What is encoded while odometry is late, on a busy machine, has none."""
+"""Sensors with poses at their header's time. Objects encoded while odometry is late, on a busy machine, have none."""
 FAST = {'catalog.period_s': 2.0, 'lowstate.batch_s': 2.0}
 
 
 def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
-    """All objects of a robot, with what they say of themselves; but not the catalog."""
+    """All objects of a robot, with their metadata; except the catalog."""
     found = {}
     for bucket in ('sensor-data', 'trajectories'):
         for info in store.list(bucket, f'{robot}/'):
@@ -60,7 +60,7 @@ def cataloged(store: S3Store, robot: str) -> list[dict[str, Any]]:
 
 
 def started_ns(rows: list[dict[str, Any]], store: S3Store) -> int:
-    """When the simulated robot began: the time from which its odometry is the simulator's own."""
+    """When the simulated robot started: the time from which its odometry is the simulator's."""
     odometry = [json.loads(store.get(row['bucket'], row['key'])) for row in rows if row['sensor'] == 'odom']
     assert len(odometry) > 3
     world = World.of(SEED)
@@ -77,7 +77,7 @@ def started_ns(rows: list[dict[str, Any]], store: S3Store) -> int:
 
 
 def check(rows: list[dict[str, Any]], objects: dict[tuple[str, str], ObjectInfo], store: S3Store) -> None:
-    """All of the bucket but the catalog is in it once, as the bucket says it, and poses are the simulator's within 10 cm."""
+    """Each object of the bucket except the catalog is in it once, with equal values and poses within 10 cm of the simulator's."""
     assert Counter((row['bucket'], row['key']) for row in rows) == Counter(objects.keys())
     for row in rows:
         info = objects[row['bucket'], row['key']]
@@ -107,7 +107,7 @@ def test_every_object_has_one_row_and_the_right_pose(session: Session, store: S3
 
 
 def judge_gaps(source: Bucket, robot: str, ledger: dict[str, Any]) -> None:
-    """What left the robot adds up to its ledger, and it is known how far that is all."""
+    """The gaps in the store add up to the ledger, and the watermark covers them."""
     told = Counter[tuple[str, str, str]]()
     for row in lake.sql('SELECT sink, topic, kind, count FROM gaps', source, robot=robot).to_pylist():
         told[row['sink'], row['topic'], row['kind']] += row['count']
@@ -119,14 +119,14 @@ def judge_gaps(source: Bucket, robot: str, ledger: dict[str, Any]) -> None:
 
 
 def spans(source: Bucket, robot: str, topic: str) -> list[tuple[int, int]]:
-    """Of its watermarks, one a session."""
+    """The periods of its watermarks, one per session."""
     query = "SELECT from_ns, to_ns FROM watermarks WHERE sink = 'objects' ORDER BY from_ns"
     return [(row['from_ns'], row['to_ns']) for row in lake.sql(query, source, robot=robot, topic=topic).to_pylist()]
 
 
 @pytest.mark.timeout(300 + 2 * DURATION_S)
 def test_gaps_and_watermarks_reach_the_store(session: Session, seaweed: Tower) -> None:
-    """The journal in the store adds up to the ledger; a node that ended by itself leaves nothing open of what it heard."""
+    """The journal in the store adds up to the ledger; a node that stopped properly leaves no received message open."""
     source = Bucket(seaweed.store_settings(), catalog.BUCKET)
     judge_gaps(source, session.robot, session.ledger)
     for topic in ('/imu', '/odom', '/joint_states'):
@@ -135,13 +135,13 @@ def test_gaps_and_watermarks_reach_the_store(session: Session, seaweed: Tower) -
         assert first_ns - stamps[0] < 10 * SECOND
         assert stamps[-1] - SECOND // 2 < last_ns <= session.ended_ns, 'the node listens until it ends'
         known = lake.known(session.robot, topic, stamps[0], max(stamps[-1], last_ns) + SECOND, source=source)
-        assert [each.is_open for each in known.stretches][-1], 'what comes after the last message nobody knows'
+        assert [each.is_open for each in known.stretches][-1], 'the time after the last message is unknown'
         assert not any(each.is_open for each in known.between(first_ns, last_ns).stretches)
 
 
 @pytest.mark.long('a kill')
 def test_a_killed_node_reports_all_gaps(processes: Processes, seaweed: Tower, store: S3Store) -> None:
-    """In the middle of a mission, once a part is there, and started again: each object has one row, with its mission."""
+    """During a mission, once a part is there, and restarted: each object has one row, with its mission."""
     node = processes.node(seaweed.environment(), FAST)
     robot = processes.sim(f'seed:={SEED}', 'image_raw:=false')
     logger = MissionDataLogger(home=node.home, robot=processes.robot, replay=False, start_timeout_s=0.0)
@@ -155,7 +155,7 @@ def test_a_killed_node_reports_all_gaps(processes: Processes, seaweed: Tower, st
         node.kill()
         node = processes.node(seaweed.environment(), FAST)
         stored = node.topic('/odom')['stored']
-        until(lambda: node.topic('/odom')['stored'] >= stored + 3, 'the robot is heard again')
+        until(lambda: node.topic('/odom')['stored'] >= stored + 3, "the robot's messages are received again")
         robot.signal(signal.SIGINT)
         assert robot.wait() == 0
         logger.end_mission(True, 0.0, 0.0)

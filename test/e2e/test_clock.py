@@ -25,11 +25,11 @@ PARAMETERS = {
 GROUP = 40
 SECOND = 10**9
 RIGHT_NS = SECOND
-"""How exactly a date has to be right."""
+"""The required accuracy of a date."""
 
 
 class Robot:
-    """A node whose clock stands in 1970 until it is set."""
+    """A node with a clock in 1970 until it is set."""
 
     def __init__(self, processes: Processes, folder: Path) -> None:
         self._processes = processes
@@ -51,7 +51,7 @@ class Robot:
         return self.node
 
     def publish(self) -> None:
-        """The next group on both topics."""
+        """Publish the next group on both topics."""
         numbers = range(len(self.spans) * GROUP, len(self.spans) * GROUP + GROUP)
         began_ns = time.time_ns()
         self.publisher.publish('/talk', texts(numbers))
@@ -77,7 +77,7 @@ class Robot:
         return Objects.of(store, 'sensor-data', self.node.robot)
 
     def clocks_of(self, sensor: str) -> set[str]:
-        """How its objects say that they know their date."""
+        """The sources of the dates in its objects."""
         with closing(DirectoryStore(self.node.home / 'store')) as store:
             store.open()
             found = store.list('sensor-data', f'{self.node.robot}/{sensor}/')
@@ -98,7 +98,7 @@ def robot(processes: Processes, tmp_path: Path) -> Robot:
 
 @pytest.mark.long('a second of CPU or more')
 def test_objects_are_dated_when_the_clock_is_set(robot: Robot) -> None:
-    """Nothing is stored under a date of 1970, all of it under the right one, and the ledger says what the clock did."""
+    """Nothing is stored under a date of 1970, everything under the correct one, and the ledger reports the clock's steps."""
     robot.publish()
     robot.node.stop()
     robot.start()
@@ -121,7 +121,7 @@ def test_objects_are_dated_when_the_clock_is_set(robot: Robot) -> None:
 
 @pytest.mark.long('ten seconds of a clock that is not set')
 def test_bags_are_dated_when_the_clock_is_set(robot: Robot, tmp_path: Path) -> None:
-    """Each has the date at which it began, also one that ended before anybody knew it; none spans the moment, nothing is lost."""
+    """Each has its start date, also one that ended before the date was known; none spans the change, nothing is lost."""
     robot.node.stop()
     began_ns = [time.time_ns()]
     robot.start(**{'bag.record': 'always'})

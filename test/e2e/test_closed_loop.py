@@ -1,4 +1,4 @@
-"""The loop closed: a robot is driven and recorded, a policy is fitted to that, signed, published, and drives the robot."""
+"""The closed loop: a robot is driven and recorded, a policy is fitted to that, signed, published, and drives the robot."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from shadowhound_data_logger.missions.folder import MissionFolder, missions
 ROOT: Final = Path(__file__).parents[2]
 MAIN: Final = [sys.executable, '-m', 'shadowhound_data_logger.cli.main']
 FORWARD, TURN = 0.4, 0.3
-"""What the teacher tells the robot, m/s and rad/s."""
+"""The teacher's commands, m/s and rad/s."""
 PARAMETERS: Final = {
     'cmd_vel.enabled': True, 'camera.rate_hz': 5.0, 'odom.rate_hz': 0.0, 'lidar.enabled': False, 'mission.capture': 'always',
 }  # fmt: skip
 
 
 def fitted(exported: Path, folder: Path) -> str:
-    """A line through the dataset, as ONNX: from the state to the action; the digest of what it was fitted to."""
+    """A linear fit to the dataset, as ONNX: from the state to the action; and the digest of the dataset."""
     from onnx import TensorProto, helper, numpy_helper
 
     info = json.loads((exported / 'meta/info.json').read_bytes())
@@ -71,7 +71,7 @@ def fitted(exported: Path, folder: Path) -> str:
 
 
 def summary(server: Server, command: str) -> dict[str, Any]:
-    """Of a mission, as MLflow has it."""
+    """The summary of a mission in MLflow."""
     path = server.client.download_artifacts(server.run(command).info.run_id, 'summary.json')
     found: dict[str, Any] = json.loads(Path(path).read_bytes())
     gc.collect()  # MLflow's client of artifacts keeps a thread until it is collected
@@ -84,7 +84,7 @@ def summary(server: Server, command: str) -> dict[str, Any]:
 def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - one story
     processes: Processes, tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The robot goes where the policy says, stands when it is gone, and the mission's run leads to the data it was made of."""
+    """The robot follows the policy, stops when it is removed, and the mission's run leads to the policy's training data."""
     environ = tower.environment()
     for name, value in environ.items():
         monkeypatch.setenv(name, value)
@@ -101,7 +101,7 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
 
     node = processes.node(environ, PARAMETERS)
     processes.sim('obey:=true', 'image_raw:=false', GENTLE)
-    until(lambda: node.topic('/odom').get('received', 0) > 0, 'the robot is heard')
+    until(lambda: node.topic('/odom').get('received', 0) > 0, "the robot's messages are received")
     station = Station(processes.environ)
     told = station.node.create_publisher(Twist, 'cmd_vel', 1)
     heard: list[Odometry] = []
@@ -130,7 +130,7 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
             logger.close()
         return run_id
 
-    # A person drives, and all is recorded.
+    # A person drives, and everything is recorded.
     command = Twist()
     command.linear.x, command.angular.z = FORWARD, TURN
     until(lambda: told.get_subscription_count() == 2, 'robot and node listen to the teacher')
@@ -140,7 +140,7 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
         return time.monotonic() - begun > 8.0 and any(one.pose.pose.position.x > 0.5 for one in heard)
 
     taught = mission(f'taught {robot}', went, lambda: told.publish(command))
-    # The mission becomes a dataset, and that a policy.
+    # The mission becomes a dataset, and the dataset a policy.
     asked = ('query', "SELECT count(*) AS rows FROM objects WHERE sensor = 'cmd_vel'", '--mission', taught, '--json')
     until(lambda: sum(row['rows'] for row in run(*asked)), 'the catalog has arrived')
     exported = tmp_path / policy
@@ -155,7 +155,7 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
     pack = ('policy', 'pack', str(tmp_path / 'trained'), '--name', policy, '--smoke', sample, '--dataset', digest)
     made = run(*pack, '--fps', '10', '--max-p99-ms', '10000', '--to', packed, '--json')['policy']
     run('policy', 'publish', packed, '--alias', 'canary', '--canary', robot)
-    # The canary takes it; another robot does not.
+    # The canary takes it; the other robot does not.
     thor = (
         tower.environment('thor')
         | tower.tracking('thor')
@@ -180,8 +180,8 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
 
     driven = mission(f'driven {robot}', gone)
     driver.kill()
-    until(lambda: heard[-1].twist.twist.linear.x == 0.0 or station.spin(), 'without its policy it stands')
-    # Who drove, and what that was made of.
+    until(lambda: heard[-1].twist.twist.linear.x == 0.0 or station.spin(), 'without its policy the robot stops')
+    # The policy that drove, and its training data.
     server = Server(tower, None)  # type: ignore[arg-type]  # no wire
     assert server.run(f'driven {robot}').data.params['policy'] == made
     assert summary(server, f'driven {robot}')['policy'] == made

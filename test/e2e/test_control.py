@@ -1,4 +1,4 @@
-"""Operating a running node: flush, pause, settings changed while it runs, diagnostics, several robots on one machine."""
+"""Operating a running node: flush, pause, settings changed at run time, diagnostics, several robots on one machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SENSORS = ['flushed', 'repeated', 'paused', 'switched', 'dormant', 'sampled', 't
 
 @dataclass(frozen=True, slots=True)
 class Operated:
-    """A node whose batches close when they are told to, somebody who publishes, and somebody who operates it."""
+    """A node with batches that close on request, a publisher, and an operator."""
 
     node: Node
     publisher: Publisher
@@ -36,13 +36,13 @@ class Operated:
     stored: Callable[..., Objects]
 
     def publish(self, name: str, numbers: range) -> None:
-        """Messages that the node has received on return."""
+        """Publish messages; returns when the node has received them."""
         before = self.node.topic(f'/{name}').get('received', 0)
         self.publisher.publish(f'/{name}', texts(numbers))
         self.node.received(f'/{name}', before + len(numbers))
 
     def numbers(self, name: str) -> list[int]:
-        """Those in the store, once all that is spooled is there."""
+        """The numbers in the store, once everything spooled is there."""
         until(lambda: not self.node.topic(f'/{name}')['stored_in']['pending'], f'{name} is delivered')
         return self.stored(f'{self.node.robot}/{name}').numbers(name)
 
@@ -62,7 +62,7 @@ def operated(shared: Processes, seaweed: Tower, stored: Callable[..., Objects]) 
 
 
 def test_a_flush_spools_all_that_was_published_before(operated: Operated) -> None:
-    """With its answer everything is durable, the messages that nobody had taken yet among it."""
+    """With its response everything is durable, including messages that were still in the middleware."""
     operated.publisher.matched('/flushed')
     operated.publisher.publish('/flushed', texts(range(COUNT)), 0.0)
     answer = operated.station.flush()
@@ -74,7 +74,7 @@ def test_a_flush_spools_all_that_was_published_before(operated: Operated) -> Non
 
 
 def test_flushes_within_a_second_overwrite_nothing(operated: Operated) -> None:
-    """Objects of the same period have names of their own."""
+    """Objects of the same period have different names."""
     operated.publisher.matched('/repeated')
     for number in range(5):
         operated.publisher.publish('/repeated', texts([number]), 0.0)
@@ -84,13 +84,13 @@ def test_flushes_within_a_second_overwrite_nothing(operated: Operated) -> None:
 
 
 def test_a_pause_counts_what_it_does_not_store(operated: Operated) -> None:
-    """What came before it is spooled, what comes during it is listed as lost by it, what comes after it is stored."""
+    """Messages before it are spooled, those during it are counted as lost by it, those after it are stored."""
     operated.publisher.matched('/paused')
     operated.publish('paused', range(COUNT))
     assert f'1 object with {COUNT} messages spooled' in operated.station.pause(paused=True)
     operated.publish('paused', range(COUNT, 2 * COUNT))
     assert operated.node.topic('/paused')['dropped'] == {'paused': COUNT}
-    until(lambda: operated.station.diagnostics()['sensor_logger: node'].level == DiagnosticStatus.WARN, 'the pause is told')
+    until(lambda: operated.station.diagnostics()['sensor_logger: node'].level == DiagnosticStatus.WARN, 'the pause is reported')
     assert operated.station.pause(paused=False) == 'messages are stored again'
     operated.publish('paused', range(2 * COUNT, 3 * COUNT))
     operated.station.flush()
@@ -99,13 +99,13 @@ def test_a_pause_counts_what_it_does_not_store(operated: Operated) -> None:
 
 
 def test_a_sensor_is_switched_off_and_on(operated: Operated) -> None:
-    """While it is off its messages are not ours, so nothing was missed when it is on again."""
+    """While it is disabled its messages do not count, so nothing was missed when it is enabled again."""
     operated.publisher.matched('/switched')
     operated.publish('switched', range(COUNT))
     assert operated.station.set(switched__enabled=False) == ''
     until(lambda: operated.node.topic('/switched')['stored'] == COUNT, 'its open batch is spooled')
     listening = operated.station.node.get_subscriptions_info_by_topic
-    until(lambda: not listening('/switched'), lambda: f'nobody listens: {[str(each) for each in listening("/switched")]}')
+    until(lambda: not listening('/switched'), lambda: f'no subscriptions left: {[str(each) for each in listening("/switched")]}')
     operated.publisher.publish('/switched', texts(range(COUNT, 2 * COUNT)))
     assert operated.station.set(switched__enabled=True) == ''
     operated.publisher.heard('/switched', operated.node, texts(['again'])[0])
@@ -118,7 +118,7 @@ def test_a_sensor_is_switched_off_and_on(operated: Operated) -> None:
 
 
 def test_a_sensor_that_is_off_in_the_file_is_switched_on(operated: Operated) -> None:
-    """It is there, and listened to once it is enabled."""
+    """It exists, and has a subscription once it is enabled."""
     assert not operated.station.node.count_subscribers('/dormant')
     assert operated.station.set(dormant__enabled=True) == ''
     operated.publisher.matched('/dormant')
@@ -128,20 +128,20 @@ def test_a_sensor_that_is_off_in_the_file_is_switched_on(operated: Operated) -> 
 
 
 def test_a_changed_rate_applies_immediately(operated: Operated) -> None:
-    """A message in a thousand seconds becomes every message; the number may be given without a fraction."""
+    """One message per thousand seconds becomes every message; the number may be an integer."""
     operated.publisher.matched('/sampled')
     operated.publish('sampled', range(COUNT))
     assert operated.node.topic('/sampled')['skipped'] == COUNT - 1
     assert operated.station.set(sampled__rate_hz=0) == ''
     operated.node.await_log('sampled.rate_hz = 0.0 from now on')
-    operated.station.flush()  # the intake has done what was asked of it before
+    operated.station.flush()  # the intake has handled the change
     operated.publish('sampled', range(COUNT, 2 * COUNT))
     operated.station.flush()
     assert operated.numbers('sampled') == [0, *range(COUNT, 2 * COUNT)]
 
 
 def test_a_wrong_setting_changes_nothing(operated: Operated) -> None:
-    """It is refused by name, value and what is allowed, with all that was to be set with it; what is not live as well."""
+    """It is refused by name, value and what is allowed, with everything set in the same call; read-only settings as well."""
     reason = operated.station.set(told__priority=1, told__rate_hz=1e-9)
     assert all(words in reason for words in ('told.rate_hz', '1e-09', 'at least 0.0001'))
     assert 'read-only' in operated.station.set(told__batch_s=1.0)
@@ -150,7 +150,7 @@ def test_a_wrong_setting_changes_nothing(operated: Operated) -> None:
 
 
 def tell(operated: Operated, *words: str) -> tuple[bool, str]:
-    """What ``shadowhound-data node`` answers; its exit code says the same."""
+    """The output of ``shadowhound-data node``; its exit code agrees."""
     spool = str(operated.node.home / 'spool')
     result = CliRunner().invoke(cli, ['node', *words, '--json', '--spool', spool], standalone_mode=False)
     answer = json.loads(result.stdout)
@@ -159,7 +159,7 @@ def tell(operated: Operated, *words: str) -> tuple[bool, str]:
 
 
 def test_the_command_line_does_what_the_services_do(operated: Operated) -> None:
-    """Through the socket the node answers in the same words, and what one of the two did the other one finds done."""
+    """Over the socket the node responds with the same text, and each of the two sees the effects of the other."""
     operated.publisher.matched('/asked')
     operated.publisher.publish('/asked', texts(range(COUNT)), 0.0)
     assert tell(operated, 'flush') == (True, f'1 object with {COUNT} messages spooled')
@@ -186,7 +186,7 @@ def test_the_command_line_does_what_the_services_do(operated: Operated) -> None:
      ('rate_hz', 'often'), ('enabled', 1), ('priority', 10), ('quality', 101), ('batch_s', 1.0)],
 )  # fmt: skip
 def test_a_parameter_is_checked_alike_by_services_and_command_line(operated: Operated, name: str, value: Any) -> None:
-    """By the command line and by ROS; what is refused has the same reason, and says more where it can never be set."""
+    """By the command line and by ROS; the reasons are the same, with more detail if the parameter can never be set."""
     full = f'asked.{name}'
     before = operated.station.get(full)
     reason = operated.station.set(**{f'asked__{name}': value})
@@ -201,7 +201,7 @@ def test_a_parameter_is_checked_alike_by_services_and_command_line(operated: Ope
 
 
 def test_diagnostics_cover_each_part(operated: Operated) -> None:
-    """There is an entry for each topic and stage, with the robot as hardware, while somebody listens."""
+    """While there is a subscriber there is an entry for each topic and stage, with the robot as hardware."""
     operated.publisher.matched('/told')
     operated.publish('told', range(COUNT))
     found = operated.station.diagnostics()
@@ -213,7 +213,7 @@ def test_diagnostics_cover_each_part(operated: Operated) -> None:
     assert int({pair.key: pair.value for pair in found['sensor_logger: /told'].values}['received']) >= COUNT
     operated.publisher.destroy('/told')
     stale = DiagnosticStatus.STALE
-    until(lambda: operated.station.diagnostics()['sensor_logger: /told'].level == stale, 'nobody publishes it any more')
+    until(lambda: operated.station.diagnostics()['sensor_logger: /told'].level == stale, 'the topic has no publisher')
 
 
 def test_the_status_file_matches_the_ledger(operated: Operated) -> None:
@@ -236,7 +236,7 @@ def test_the_status_file_matches_the_ledger(operated: Operated) -> None:
 
 @pytest.mark.long('robots of their own')
 def test_two_robots_on_one_machine_share_a_spool(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
-    """Two nodes in namespaces of their own share a spool: both log, one of them delivers for both, both accounts balance."""
+    """Two nodes in different namespaces share a spool: both log, one of them delivers for both, both accounts balance."""
     robots = [f'{processes.robot}_{number}' for number in range(2)]
     parameters = {'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 0.2}
     nodes = [processes.node(seaweed.environment(), parameters, '-r', f'__ns:=/{robot}', robot='') for robot in robots]

@@ -1,4 +1,4 @@
-"""A robot that speaks Cyclone DDS: the node listens through Fast DDS, hears it, and accounts for all of it."""
+"""A robot with Cyclone DDS: the node subscribes through Fast DDS, receives its messages, and accounts for all of them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from shadowhound_data_logger.node.intake.middleware import possible_buffer
 pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 
 CYCLONE = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
-"""What the environment of such a robot has."""
+"""The environment of such a robot."""
 COUNT = 200
 SENSORS = {'sensors': ['plain'], 'plain.topics': ['plain'], 'plain.rate_hz': 0.0, 'plain.batch_s': 0.2}
 
 
 @pytest.mark.parametrize('reliable', [False, pytest.param(True, marks=pytest.mark.long('a robot of its own'))])
 def test_the_account_of_a_cyclone_robot_is_exact(processes: Processes, *, reliable: bool) -> None:
-    """Its messages are numbered for us, though its own RMW would not tell; the first line says how we listen."""
+    """Its messages are numbered for us, though its own RMW has no numbers; the first line reports our RMW."""
     node = processes.node(None, SENSORS, environ=CYCLONE)
     assert "listening by rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp" in node.log
     driver = processes.publisher(cyclone=True)
@@ -46,7 +46,7 @@ LARGE_COUNT = 40
 @pytest.mark.long('fourteen seconds of images and clouds')
 @pytest.mark.parametrize('kind', LARGE)
 def test_large_messages_arrive_as_they_do_with_cyclone_dds(processes: Processes, kind: str) -> None:
-    """Raw images and clouds, BEST_EFFORT and depth 1 as a Go2's driver has them: never fewer than its own RMW gets."""
+    """Raw images and clouds, BEST_EFFORT and depth 1 as in a Go2's driver: never fewer than its own RMW receives."""
     type_name, rate_hz, fields = LARGE[kind]
     own = {'sensors': ['large'], 'large.topics': ['large'], 'large.types': [type_name], 'large.format': 'cdr'}
     node = processes.node(None, own, environ=CYCLONE)
@@ -67,9 +67,9 @@ def test_large_messages_arrive_as_they_do_with_cyclone_dds(processes: Processes,
 @pytest.mark.slow
 @pytest.mark.long('a node that is stopped until Fast DDS loses its place')
 def test_a_publisher_that_outruns_the_node_loses_messages_and_not_the_topic(processes: Processes) -> None:
-    """It no longer has the parts that the node lacks, and Fast DDS loses its place: nothing is invented, the topic goes on.
+    """It no longer has the fragments that the node lacks, and Fast DDS loses its position: it continues, nothing is invented.
 
-    Humble's Fast DDS 2.6 keeps its place here, so there the node is stopped a number of times only.
+    Humble's Fast DDS 2.6 keeps its position, so there the node is only stopped several times.
     """
     stops = 0
     node, driver = processes.node(None, SENSORS, environ=CYCLONE), processes.publisher(cyclone=True)

@@ -1,4 +1,4 @@
-"""Two machines in one network, made of namespaces: we find whom a reader in the robot's Cyclone DDS finds, in each setting."""
+"""Two machines in one network, made of namespaces: we discover what the robot's Cyclone DDS discovers, in each setting."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from e2e.processes import WAIT_S
 pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 
 MORE_S = 2.0
-"""For somebody who is not to be found to be found all the same."""
+"""Enough time to discover a publisher that must not be discovered."""
 BOTH, ONE, NONE = ['/here', '/there'], ['/here'], list[str]()
 
 
@@ -40,7 +40,7 @@ def peers(*addresses: str) -> dict[str, str]:
 
 HUMBLE = {'AS_HUMBLE': 'yes'}
 OWN = on('name="eth0"')
-"""With two interfaces Cyclone DDS takes one of them, and which one is not said: so it is named wherever that matters."""
+"""With two interfaces Cyclone DDS chooses one, which is not specified: so it is configured wherever that matters."""
 CASES: dict[str, tuple[dict[str, str], dict[str, str], list[str]]] = {
     'default': (OWN, {}, BOTH),
     'humble': ({**HUMBLE, **OWN}, HUMBLE, BOTH),
@@ -61,9 +61,9 @@ CASES: dict[str, tuple[dict[str, str], dict[str, str], list[str]]] = {
     'peers only': (peers(ROBOT, OTHER), peers(OTHER, ROBOT), BOTH),
     'peers on this machine': (peers(ROBOT), peers(OTHER), ONE),
 }  # fmt: skip
-"""Variables of the robot, of the other machine, and which topics are to be heard."""
+"""Variables of the robot, of the other machine, and the topics that must be received."""
 RANGES = ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY')
-if os.environ.get('ROS_DISTRO') == 'humble':  # whose librcl knows no range, and its Cyclone DDS gets no peers of ROS
+if os.environ.get('ROS_DISTRO') == 'humble':  # whose librcl has no range, and its Cyclone DDS gets no peers of ROS
     CASES = {
         name: ({**HUMBLE, **robot}, {**HUMBLE, **other}, topics)
         for name, (robot, other, topics) in CASES.items()
@@ -78,7 +78,7 @@ def ready(process: subprocess.Popen[str]) -> subprocess.Popen[str]:
 
 
 def heard(process: subprocess.Popen[str]) -> Any:
-    """What it has heard so far."""
+    """What it has received so far."""
     assert process.stdin is not None
     assert process.stdout is not None
     process.stdin.write('\n')
@@ -88,7 +88,7 @@ def heard(process: subprocess.Popen[str]) -> Any:
 
 @pytest.fixture(scope='module')
 def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, tuple[list[str], list[str]]]]:
-    """By case: what a reader in the robot's Cyclone DDS heard, and what we heard. All cases at once, each in its domain."""
+    """By case: what a reader with the robot's Cyclone DDS received, and what we received. All cases together, one domain each."""
     domains = {name: {'ROS_DOMAIN_ID': str(number)} for number, name in enumerate(CASES, 1)}
     rmw = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
     robot = [{**CASES[name][0], **domains[name], **rmw} for name in CASES]
@@ -117,7 +117,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, tuple[
 
 
 def as_humble(folder: Path) -> Mapping[str, str]:
-    """Variables in which rmw_fastrtps_cpp has the version of Humble, so that the range means nothing."""
+    """Variables with which rmw_fastrtps_cpp has the version of Humble, so that the range has no effect."""
     index = folder / 'share/ament_index/resource_index/rmw_typesupport'
     index.mkdir(parents=True)
     (index / 'rmw_fastrtps_cpp').touch()
@@ -129,8 +129,8 @@ def as_humble(folder: Path) -> Mapping[str, str]:
 @pytest.mark.long('machines of their own, one after the other')
 @pytest.mark.parametrize('case', CASES)
 def test_publishers_that_cyclone_dds_finds_are_found(found: dict[str, tuple[list[str], list[str]]], case: str) -> None:
-    """Nothing that the robot's own RMW hears is lost, and nobody else is heard."""
+    """Nothing that the robot's own RMW receives is lost, and no other publisher is received."""
     by_cyclone, by_us = found[case]
-    assert set(by_cyclone) <= set(by_us), 'the robot hears what we do not'
+    assert set(by_cyclone) <= set(by_us), 'the robot receives a topic that we do not'
     assert by_us == CASES[case][2]
     assert set(by_cyclone) <= set(TOPICS)

@@ -1,4 +1,4 @@
-"""Events of the node: the seconds before and after a trigger are in a separate bag, whatever triggered it."""
+"""Events of the node: the seconds before and after any kind of trigger are in a separate bag."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def publisher_of(processes: Processes, topic: str = TOPIC) -> Publisher:
 
 
 def status(node: Node) -> dict[str, Any]:
-    """What the node tells of its events."""
+    """The node's status of its events."""
     path = file(node.home / 'spool', node.robot)
-    until(path.exists, 'the node tells its status')
+    until(path.exists, 'the node has written its status')
     found: dict[str, Any] = json.loads(path.read_text())['events']
     return found
 
@@ -43,7 +43,7 @@ def numbers(bag: Bag) -> list[int]:
 
 
 def marks(bag: Bag) -> list[tuple[str, int, int]]:
-    """What tells each of its messages from the others."""
+    """The identity of each of its messages."""
     return [(each.topic, each.publish_ns, each.sequence) for each in bag.messages()]
 
 
@@ -52,7 +52,7 @@ def triggers(bag: Bag) -> list[tuple[str, str]]:
 
 
 def event_of(node: Node, processes: Processes, store: ObjectStore, folder: Path) -> Bag:
-    """The one event, once it is delivered."""
+    """The only event, once it is delivered."""
     until(lambda: status(node)['written'] == 1, 'the event is written')
     node.delivered()
     (bag,) = bags(store, processes.robot, folder)
@@ -62,7 +62,7 @@ def event_of(node: Node, processes: Processes, store: ObjectStore, folder: Path)
 def test_messages_before_and_after_a_trigger_are_in_a_bag(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:
-    """Of topics that no sensor takes; the manifest says who triggered, the ledger counts what was asked for, and nothing else."""
+    """For topics without a sensor; the manifest names the trigger, the ledger counts only the requested messages."""
     node = processes.node(seaweed.environment(), SETTINGS)
     publisher = publisher_of(processes)
     publisher.publish(TOPIC, texts(range(20)))
@@ -91,7 +91,7 @@ def test_messages_before_and_after_a_trigger_are_in_a_bag(
 
 @pytest.mark.long('fifteen seconds of events')
 def test_conditions_and_agent_events_trigger(processes: Processes, seaweed: Tower, store: ObjectStore) -> None:
-    """Over all topics of the robot, from the subscriptions that serve objects and a bag as well; nothing of it is lost."""
+    """For all topics of the robot, with the subscriptions that also serve objects and a bag; none of their messages are lost."""
     parameters = {
         'events.regex': '.*', 'events.exclude': 'image_raw|rosout|events|sensor_logger_node|diagnostics', 'events.post_s': 8.0,
         'events.conditions': ['awake: imu:temperature > -100 for 1', 'never: odom:pose.pose.position.x > 1e9'],
@@ -135,7 +135,7 @@ def test_conditions_and_agent_events_trigger(processes: Processes, seaweed: Towe
 
 
 def messages_in(open_slice: Path) -> int:
-    """So many would be left by a kill."""
+    """The number of messages that a kill would leave."""
     with open_slice.open('rb') as file:
         return scan(file.fileno()).contents.messages
 
@@ -144,7 +144,7 @@ def messages_in(open_slice: Path) -> int:
 def test_the_next_start_completes_an_event_that_a_kill_interrupted(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:
-    """The next start makes its bag whole with what was written; the bag and the ledger say what is missing."""
+    """The next start completes its bag with what was written; the bag and the ledger report what is missing."""
     node = processes.node(seaweed.environment(), {**SETTINGS, 'events.post_s': 60.0})
     publisher = publisher_of(processes)
     publisher.publish(TOPIC, texts(range(20)))

@@ -26,19 +26,19 @@ TALK = {
 
 
 class Talk:
-    """A node, and a publisher whose numbers go up from 0."""
+    """A node, and a publisher with numbers from 0 on."""
 
     def __init__(self, node: Node, publisher: Publisher) -> None:
         self.node, self.publisher, self.count = node, publisher, 0
 
     def publish(self) -> None:
-        """Some more numbers, durable in the spool when it returns."""
+        """Publish more numbers, which are durable in the spool on return."""
         self.publisher.publish(TOPIC, texts(range(self.count, self.count + COUNT)))
         self.count += COUNT
         until(lambda: self.node.topic(TOPIC).get('stored', 0) == self.count, 'all is spooled')
 
     def delivered(self, objects: Callable[[], Objects]) -> None:
-        """All numbers so far come to be in the store, once."""
+        """All numbers so far are eventually in the store, once."""
         self.node.settled(TOPIC, self.count)
         assert objects().numbers('talk') == list(range(self.count))
 
@@ -62,7 +62,7 @@ MORE = pytest.mark.long('four seconds each')
 
 @pytest.fixture(scope='module')
 def wired(shared: Processes, seaweed: Tower, wire: Wire) -> Talk:
-    """A node that reaches the server by the wire."""
+    """A node that reaches the server over the wire."""
     return talk(shared, {**seaweed.environment(), 'AWS_ENDPOINT_URL': wire.url})
 
 
@@ -80,7 +80,7 @@ def wired(shared: Processes, seaweed: Tower, wire: Wire) -> Talk:
 def test_everything_is_delivered_after_the_store_recovers(
     wired: Talk, wire: Wire, shared: Processes, stored: Callable[..., Objects], mode: str | tuple[int, str], words: str
 ) -> None:
-    """Each fault has a message of its own; what is published meanwhile waits, and is delivered when the fault is gone."""
+    """Each fault has a separate message; what is published during it waits, and is delivered when the fault ends."""
     wired.publish()
     wired.node.settled(TOPIC, wired.count)
     assert words not in wired.node.log
@@ -95,13 +95,13 @@ def test_everything_is_delivered_after_the_store_recovers(
     finally:
         wire.set(PASS)
     wired.delivered(lambda: stored(shared.robot))
-    until(lambda: wired.node.log.count('delivery continues') == recovered + 1, 'the node says that it is over')
+    until(lambda: wired.node.log.count('delivery continues') == recovered + 1, 'the node reports the recovery')
     assert wired.node.ledger()['objects']['quarantined'] == 0
 
 
 @pytest.mark.long('a Tower of its own')
 def test_objects_wait_for_a_server_that_starts_later(processes: Processes, tmp_path: Path) -> None:
-    """A node that is started before its server delivers once the server is started."""
+    """A node that starts before its server delivers once the server is running."""
     with Tower(tmp_path / 'tower') as late, closing(S3Store(late.store_settings(), UploadSettings())) as store:
         late.stop_s3()
         talking = talk(processes, late.environment())
@@ -116,7 +116,7 @@ def test_objects_wait_for_a_server_that_starts_later(processes: Processes, tmp_p
 def test_a_wrong_secret_pauses_delivery_and_is_not_shown(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects]
 ) -> None:
-    """A real server's refusal pauses delivery and names the variables, never the secret; a right secret delivers all."""
+    """A real server's refusal pauses delivery and names the variables, never the secret; a valid secret delivers everything."""
     wrong = {**seaweed.environment(), 'AWS_SECRET_ACCESS_KEY': 'not-the-secret'}
     talking = talk(processes, wrong)
     talking.publish()
@@ -129,7 +129,7 @@ def test_a_wrong_secret_pauses_delivery_and_is_not_shown(
 
 
 def test_a_missing_bucket_is_created(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
-    """Where the credentials allow it, the bucket is created, and the log says so."""
+    """If the credentials allow it, the bucket is created, and the log reports it."""
     bucket = f'fresh-{processes.robot}'
     talking = talk(processes, seaweed.environment(), **{'talk.bucket': bucket})
     talking.publish()
@@ -152,7 +152,7 @@ def owner(seaweed: Tower) -> Iterator[Any]:
 def test_a_bucket_that_cannot_be_created_blocks_only_its_objects(
     processes: Processes, seaweed: Tower, owner: Any, stored: Callable[..., Objects]
 ) -> None:
-    """Where they do not, the error says how to create it; its objects wait and are delivered once it is there."""
+    """If they do not, the error explains how to create it; its objects wait and are delivered once it exists."""
     talking = talk(processes, seaweed.environment('limited'), **{'talk.bucket': 'later'})
     talking.publish()
     talking.node.await_log('bucket later gets nothing')
@@ -161,7 +161,7 @@ def test_a_bucket_that_cannot_be_created_blocks_only_its_objects(
     owner.create_bucket(Bucket='later')
     try:
         talking.delivered(lambda: stored(processes.robot, 'later'))
-    finally:  # other tests begin without it
+    finally:  # other tests start without it
         processes.end()
         for item in owner.list_objects_v2(Bucket='later').get('Contents', []):
             owner.delete_object(Bucket='later', Key=item['Key'])

@@ -1,4 +1,4 @@
-"""A key with other content on a real server is not overwritten; our object is quarantined and named."""
+"""A key with different content on a real server is not overwritten; our object is quarantined and named."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def image(key: str, body: bytes) -> DataObject:
 
 
 def deliver(folder: Path, store: S3Store, *objects: DataObject) -> dict[str, int]:
-    """A spool's whole way: from the encoder's object to the server's answer; where the objects ended."""
+    """From the encoder's object to the server's response; returns the final states of the objects."""
     spool = Spool(folder, SpoolSettings(min_free_bytes=0), SystemClock.of_this_machine(), 'thor')
     spool.open()
     writer = SpoolWriter(spool, 0.01)
@@ -52,7 +52,7 @@ def deliver(folder: Path, store: S3Store, *objects: DataObject) -> dict[str, int
 
 
 def test_a_foreign_object_is_never_overwritten(tmp_path: Path, seaweed: Tower, caplog: pytest.LogCaptureFixture) -> None:
-    """Of two spools that want one key the first gets it; the second one's object goes to quarantine, and the log says why."""
+    """Two spools request one key: the first gets it; the second one's object is quarantined, and the log has the reason."""
     caplog.set_level(logging.INFO)
     key = f'thor/{tmp_path.name}/120000_front.jpg'
     store = S3Store(seaweed.store_settings(), UploadSettings())
@@ -70,7 +70,7 @@ def test_a_foreign_object_is_never_overwritten(tmp_path: Path, seaweed: Tower, c
 
 
 def test_the_same_object_twice_is_a_success(tmp_path: Path, seaweed: Tower) -> None:
-    """Content that is there already, as after an answer that was lost, is delivered and not set aside."""
+    """Content that is there already, as after a lost response, is delivered and not set aside."""
     key = f'thor/{tmp_path.name}/120001_front.jpg'
     store = S3Store(seaweed.store_settings(), UploadSettings())
     store.open()

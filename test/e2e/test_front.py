@@ -1,4 +1,4 @@
-"""With another RMW the front represents the node: it answers as the node would, and runs as long as the node does."""
+"""With another RMW the front represents the node: it responds as the node would, and runs as long as the node does."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OFFERED = 'services and parameters are offered in'
 DIRECT, BESIDE = '/direct', '/beside'
 COUNT = 20
 ENDS_S = 60.0
-"""It takes a second and a half at most on a machine that is idle."""
+"""It takes at most 1.5 s on an idle machine."""
 SENSORS: dict[str, Any] = {
     'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 3600.0,
     'events.topics': ['talk'], 'events.post_s': 0.1, 'capture.rmw': 'robot',
@@ -43,7 +43,7 @@ SENSORS: dict[str, Any] = {
 
 @pytest.fixture(scope='module')
 def nodes(shared: Processes) -> dict[str, Node]:
-    """One that speaks for itself, and one with a front, alike in all else; each with a home of its own."""
+    """A node with its own services, and one with a front, otherwise identical; each with a separate home."""
     given = {
         space: shared.node(None, SENSORS, '-r', f'__ns:={space}', home=space.strip('/'), program=program)
         for space, program in ((DIRECT, ('-m', 'shadowhound_data_logger.node.sensor_logger_node')), (BESIDE, FRONTED))
@@ -61,7 +61,7 @@ def stations(shared: Processes, nodes: dict[str, Node]) -> Iterator[dict[str, St
 
 
 def fronts(node: Node) -> list[int]:
-    """The processes that are fronts of a node."""
+    """The front processes of a node."""
     found = []
     for path in Path('/proc').glob('[0-9]*/cmdline'):
         try:
@@ -74,7 +74,7 @@ def fronts(node: Node) -> list[int]:
 
 
 def services_of(station: Station, name: str, namespace: str) -> set[str]:
-    """Without their namespaces; none of a node that is not seen yet."""
+    """Without their namespaces; none for a node that is not discovered yet."""
     try:
         found = station.node.get_service_names_and_types_by_node(name, namespace)
     except NodeNameNonExistentError:
@@ -83,7 +83,7 @@ def services_of(station: Station, name: str, namespace: str) -> set[str]:
 
 
 def test_the_front_has_the_name_and_all_services(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
-    """Those that the node has where it speaks for itself; the one that listens is hidden and offers nothing."""
+    """The same as on a node with its own services; the subscribing node is hidden and offers nothing."""
     station = stations[BESIDE]
     until(lambda: ('_sensor_logger_intake', BESIDE) in station.node.get_node_names_and_namespaces(), 'the listener is seen')
     some = {'flush', 'pause', 'bag/start', 'event/trigger', 'set_parameters', 'describe_parameters'}
@@ -98,7 +98,7 @@ def test_the_front_has_the_name_and_all_services(nodes: dict[str, Node], station
 
 
 def answers(station: Station) -> Iterator[Any]:
-    """What each service says, one after the other; a bag's name is its time, so it is left out of what it says."""
+    """The responses of all services, in order; a bag's name is its time, so it is removed from them."""
     yield 'flush', station.flush()
     yield from (('pause', station.pause(paused=paused)) for paused in (True, True, False, False))
     done, bag = station.bag('start')
@@ -112,7 +112,7 @@ def answers(station: Station) -> Iterator[Any]:
 
 
 def test_each_service_answers_as_the_node_would(stations: dict[str, Station]) -> None:
-    """In the same words, whether it is done or refused."""
+    """With the same text, whether it succeeds or is refused."""
     direct = list(answers(stations[DIRECT]))
     assert list(answers(stations[BESIDE])) == direct
     assert (False, 'nothing is recorded') in direct
@@ -132,7 +132,7 @@ def message(name: str, value: Any) -> ParameterMessage:
 
 
 def test_each_parameter_is_checked_as_by_the_node(stations: dict[str, Station]) -> None:
-    """Set alone and together, with the same reasons, and what they are afterwards is the same."""
+    """Individually and together, with the same reasons, and with the same values afterwards."""
     for name, value in VALUES:
         request = SetParameters.Request(parameters=[message(name, value)])
         direct, beside = (stations[space].call(SetParameters, '/set_parameters', request).results for space in (DIRECT, BESIDE))
@@ -145,7 +145,7 @@ def test_each_parameter_is_checked_as_by_the_node(stations: dict[str, Station]) 
 
 
 def test_each_parameter_is_described_as_by_the_node(stations: dict[str, Station]) -> None:
-    """Names, types, ranges and texts."""
+    """Names, types, ranges and descriptions."""
     direct, beside = (
         stations[space].call(ListParameters, '/list_parameters', ListParameters.Request()) for space in (DIRECT, BESIDE)
     )
@@ -157,7 +157,7 @@ def test_each_parameter_is_described_as_by_the_node(stations: dict[str, Station]
 
 
 def run(node: Node, *words: str) -> dict[str, Any]:
-    """What ``shadowhound-data node`` says."""
+    """The output of ``shadowhound-data node``."""
     spool = str(node.home / 'spool')
     result = CliRunner().invoke(cli, ['node', *words, '--json', '--spool', spool], standalone_mode=False)
     answer: dict[str, Any] = json.loads(result.stdout)
@@ -165,7 +165,7 @@ def run(node: Node, *words: str) -> dict[str, Any]:
 
 
 def test_front_and_command_line_see_each_other_s_settings(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
-    """What one of them set the other one finds; the node goes by it."""
+    """Each sees what the other set; the node uses it."""
     node, station = nodes[BESIDE], stations[BESIDE]
     assert station.set(talk__quality=77) == ''
     assert run(node, 'get', 'talk.quality')['values'] == {'talk.quality': 77}
@@ -193,20 +193,20 @@ def test_the_front_publishes_the_nodes_state(nodes: dict[str, Node], stations: d
 
 
 def test_only_a_front_compares_publishers(nodes: dict[str, Node]) -> None:
-    """A node that listens through the RMW of the robot compares nothing, and says that it does not."""
+    """A node that uses the robot's RMW compares nothing, and reports that."""
 
     def undiscovered(space: str) -> Any:
         node = nodes[space]
         return read(node.home / 'spool', node.robot, SystemClock.of_this_machine()).node.middleware.undiscovered
 
-    until(lambda: undiscovered(BESIDE) == {}, 'the front has reported, and all is heard')
+    until(lambda: undiscovered(BESIDE) == {}, 'the front reports no undiscovered publishers')
     assert undiscovered(DIRECT) is None
     with closing(connect(nodes[DIRECT].home / 'spool')) as connection:
         assert not connection.ask('compare', found={})['ok']
 
 
 def test_the_front_publishes_missions(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
-    """Latched, when one begins and when it ends."""
+    """Latched, at the start and at the end."""
     node, station = nodes[BESIDE], stations[BESIDE]
     heard: list[str] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -227,11 +227,11 @@ def test_the_front_publishes_missions(nodes: dict[str, Node], stations: dict[str
 
 @pytest.mark.long('kills')
 def test_a_front_that_exits_is_restarted(shared: Processes, nodes: dict[str, Node], stations: dict[str, Station]) -> None:
-    """The node goes on meanwhile, loses nothing, and says what happened."""
+    """The node continues, loses nothing, and reports it."""
     node, publisher = nodes[BESIDE], shared.publisher()
     publisher.create(f'{BESIDE}/talk', STRING)
     publisher.heard(f'{BESIDE}/talk', node, texts(['warm-up'])[0])
-    assert run(node, 'flush')['ok']  # what ``heard`` sent more than once is counted
+    assert run(node, 'flush')['ok']  # messages that ``heard`` sent more than once are counted
     before = node.topic(f'{BESIDE}/talk')['received']
     (first,) = fronts(node)
     publisher.publish(f'{BESIDE}/talk', texts(range(COUNT)))
@@ -247,7 +247,7 @@ def test_a_front_that_exits_is_restarted(shared: Processes, nodes: dict[str, Nod
 
 
 def test_the_front_ends_with_the_node(processes: Processes) -> None:
-    """When it is asked to end, and when it is killed: within seconds nobody answers for a node that is no more."""
+    """When it is stopped, and when it is killed: within seconds nothing responds on behalf of a node that is gone."""
     node = processes.node(None, SENSORS, program=FRONTED)
     node.await_log(OFFERED)
     assert len(fronts(node)) == 1
@@ -261,7 +261,7 @@ def test_the_front_ends_with_the_node(processes: Processes) -> None:
 
 
 def test_name_and_remappings_of_the_command_line_apply_to_the_front(processes: Processes) -> None:
-    """Another name, rules and parameters for that name alone: the front has the name, and the node goes by all of them."""
+    """A name, rules, and parameters for that name alone: the front has the name, and the node uses all of them."""
     node = processes.node(
         None, SENSORS, '-r', '__node:=mine', '-r', 'mine:talk:=heard', '-p', 'mine:talk.priority:=2', program=FRONTED
     )

@@ -39,7 +39,7 @@ def test_the_default_profile_is_accounted_for(session: Session) -> None:
 
 
 def test_the_default_profile_counts_what_the_robot_published(session: Session) -> None:
-    """The robot's own count of each topic is the ledger's, from the first message on."""
+    """The robot's count of each topic equals the ledger's, from the first message on."""
     counted = 'published' if session.node.hears_numbers else 'received'
     assert {topic: row[counted] for topic, row in session.ledger['topics'].items()} == {
         topic: count for topic, count in session.said.items() if topic in TYPES
@@ -58,7 +58,7 @@ def test_objects_have_the_documented_keys(session: Session) -> None:
     """Objects have the documented keys, in the UTC second of their first sample, and a type and hash."""
     for key, info in session.objects.infos.items():
         sensor = key.split('/')[1]
-        first = re.sub(r'_\d{1,2}(?=\.\w+$)', '', key)  # what a stalled machine delivers after its batch gets a key of its own
+        first = re.sub(r'_\d{1,2}(?=\.\w+$)', '', key)  # messages after a stall get a separate key
         assert first == key or first in session.objects.infos
         assert re.fullmatch(f'{session.robot}/{KEYS[sensor]}', first)
         when = datetime.fromtimestamp(int(info.metadata['t_start_ns']) // SECOND, timezone.utc)
@@ -69,7 +69,7 @@ def test_objects_have_the_documented_keys(session: Session) -> None:
 
 @pytest.mark.parametrize('topic', EVERY_MESSAGE)
 def test_every_sample_is_in_the_store(session: Session, topic: str) -> None:
-    """Of a topic without downsampling every message is in the store, once, under its own time."""
+    """For a topic without downsampling every message is in the store, once, under its time."""
     stamps = [sample['stamp_ns'] for sample in session.objects.samples(SENSORS[topic])]
     assert sorted(stamps) == sorted(session.by_stamp[topic])
     assert len(stamps) == session.said[topic]
@@ -84,7 +84,7 @@ def test_batches_are_as_published(session: Session, topic: str) -> None:
 
 @pytest.mark.parametrize('topic', ['/camera/compressed', '/point_cloud2', '/odom', '/lowstate'])
 def test_the_first_message_of_each_second_is_kept(session: Session, topic: str) -> None:
-    """At 1 Hz the first message of each whole second of UTC is kept, and no other."""
+    """At 1 Hz the first message of each full second of UTC is kept, and no other."""
     firsts: dict[int, int] = {}
     for stamp in sorted(session.by_stamp[topic]):
         firsts.setdefault(stamp // SECOND, stamp)
@@ -106,7 +106,7 @@ def test_images_are_as_published(session: Session) -> None:
 
 
 def test_clouds_are_as_published(session: Session) -> None:
-    """A cloud reads back, by another library, with the published points bit for bit."""
+    """With another library, a cloud has the published points bit for bit."""
     clouds = session.objects.sensor('lidar')
     assert len(clouds) >= DURATION_S
     for key, body in clouds.items():
@@ -118,7 +118,7 @@ def test_clouds_are_as_published(session: Session) -> None:
 
 
 def test_odometry_is_as_published(session: Session) -> None:
-    """An odometry record has the published pose and twist, and its time in words."""
+    """An odometry record has the published pose and twist, and its time as text."""
     records = session.objects.documents('odom')
     assert len(records) >= DURATION_S
     for record in records:

@@ -238,7 +238,7 @@ for run in runs:
 
 
 def executor(command_fails: bool) -> Any:
-    """The guide's class, with what it leaves to the existing code of the agent."""
+    """The guide's class, with stand-ins for the agent's existing code."""
     names: dict[str, Any] = {'MissionDataLogger': MissionDataLogger, 'timing': {}}
     exec(EXECUTOR, names)  # noqa: S102 - the guide's text is what is tested
 
@@ -274,8 +274,8 @@ def executor(command_fails: bool) -> Any:
 def test_the_guides_executor_and_query_run_unchanged(
     server: Server, warm_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its MissionExecutor logs a mission that succeeds and one that fails, and its query finds and prints both."""
-    import mlflow  # takes a second, which those who only collect do not need
+    """Its MissionExecutor logs a successful and a failed mission, and its query finds and prints both."""
+    import mlflow  # takes a second, not needed to collect tests
 
     monkeypatch.setenv('SHADOWHOUND_HOME', str(warm_home))
     good, bad = executor(command_fails=False), executor(command_fails=True)
@@ -311,7 +311,7 @@ logger.log_trajectory('trajectory.csv')
 logger.end_mission(True, 12.5, 60.0)
 print(run_id)
 """
-"""What calls the guide's own sketch, in a separate process: MLflow's fluent client leaves threads behind."""
+"""Calls the guide's sketch, in a separate process: MLflow's fluent client leaves threads behind."""
 RUN_TRAINING: Final = """
 import sys, types
 torch = types.ModuleType('torch')
@@ -320,7 +320,7 @@ sys.modules['torch'] = torch
 model = types.SimpleNamespace(state_dict=lambda: 'weights')
 exec(sys.argv[1], {'train_model': lambda: model})
 """
-"""The training is replaced: torch stands for its one call."""
+"""The training is replaced: a fake torch provides its only call."""
 
 
 def in_a_process(program: str, *arguments: str, folder: Path, **environ: str) -> subprocess.CompletedProcess[str]:
@@ -329,7 +329,7 @@ def in_a_process(program: str, *arguments: str, folder: Path, **environ: str) ->
 
 
 def store(server: Server, folder: Path, objects: Mapping[str, bytes]) -> None:
-    """Put them into the bucket of the robot's data, which is made where it does not exist."""
+    """Put them into the bucket of the robot's data, which is created if missing."""
     with closing(open_store(server.tower.store_settings(), UploadSettings())) as opened:
         for number, (key, content) in enumerate(objects.items()):
             path, sha256 = folder / f'{number}.jpg', hashlib.sha256(content).hexdigest()
@@ -340,7 +340,7 @@ def store(server: Server, folder: Path, objects: Mapping[str, bytes]) -> None:
 
 @pytest.mark.long('a process that loads MLflow')
 def test_the_guides_own_logger_works_next_to_this_package(server: Server, tmp_path: Path) -> None:
-    """The sketch that this package replaces runs against the same Tower, and the guide's query finds its missions as well."""
+    """The sketch that this package replaces runs with the same Tower, and the guide's query finds its missions as well."""
     store(server, tmp_path, {'thor/camera/20251018/120000_front.jpg': jpeg(120000)})
     tracking = server.tower.tracking('thor')
     done = in_a_process(RUN_LOGGER, LOGGER, 'patrol by the sketch', folder=tmp_path, **tracking)
@@ -361,7 +361,7 @@ def test_the_guides_own_logger_works_next_to_this_package(server: Server, tmp_pa
 
 @pytest.mark.long('a process that loads MLflow')
 def test_the_guides_training_script_runs_unchanged(server: Server, tmp_path: Path) -> None:
-    """It downloads what the robot stored into folders that must be there, and logs a run; docs/lake.md says which folders."""
+    """It downloads the robot's stored data into folders that must exist, and logs a run; docs/lake.md names the folders."""
     spark = {**server.tower.environment('spark'), **server.tower.tracking('spark')}
     frames = {f'thor/camera/20251018/{second:06d}_front.jpg': jpeg(second) for second in (120000, 120001)}
     store(server, tmp_path, frames)
@@ -393,7 +393,7 @@ print(run.data.params['architecture'], run.data.metrics['train_loss'], run.data.
 
 @pytest.mark.long('a program of many imports that walks for seconds')
 def test_the_example_runs_a_mission(server: Server, warm_home: Path) -> None:
-    """examples/mission_executor.py flies a mission of its simulated robot, whole and with all three pictures."""
+    """examples/mission_executor.py runs a mission of its simulated robot, complete with all three images."""
     example = Path(__file__).parents[2] / 'examples' / 'mission_executor.py'
     environ = {**os.environ, 'SHADOWHOUND_HOME': str(warm_home)}
     command = [sys.executable, str(example), 'patrol the example', '--seconds', '2']

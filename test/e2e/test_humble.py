@@ -88,7 +88,7 @@ class Node(module.Base):
     m, "RCLError", PyExc_RuntimeError);
 """,
 }
-"""A tree of rclpy with a thing of each kind."""
+"""A source tree of rclpy with one name of each kind."""
 COUNT = 200
 TOPICS = ('/one', '/two', '/latched')
 SENSORS = {
@@ -98,11 +98,11 @@ SENSORS = {
 }  # fmt: skip
 
 
-newer = pytest.mark.skipif(os.environ.get('ROS_DISTRO') == 'humble', reason='this is Humble: nothing stands in for it')
+newer = pytest.mark.skipif(os.environ.get('ROS_DISTRO') == 'humble', reason='this is Humble: it needs no imitation')
 
 
 def humble(folder: Path, rmw: str) -> dict[str, str]:
-    """The environment of a Python whose rclpy has no more than Humble's has."""
+    """The environment of a Python with an rclpy that has only Humble's names."""
     folder.mkdir()
     shutil.copy(HERE / 'humble.py', folder / 'sitecustomize.py')
     path = os.pathsep.join(filter(None, (str(folder), os.environ.get('PYTHONPATH'))))
@@ -120,7 +120,7 @@ def humble(folder: Path, rmw: str) -> dict[str, str]:
 def test_everything_is_stored_and_unknown_counts_are_null(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects], tmp_path: Path, rmw: str, grades: set[str]
 ) -> None:
-    """Of one and of two publishers and from their history, each message once; the accounts claim what they know and no more."""
+    """From one and from two publishers and from their history, each message once; the accounts have only what is known."""
     first, second = processes.publisher(), processes.publisher()
     first.create('/latched', STRING, latched=True)
     began_ns = time.time_ns()
@@ -153,7 +153,7 @@ def test_everything_is_stored_and_unknown_counts_are_null(
     assert {topic: sum(each.topic == topic for each in recorded) for topic in TOPICS} == {
         topic: row['received'] for topic, row in ledger['bags'].items()
     }
-    assert all(began_ns < each.log_ns < time.time_ns() for each in recorded), 'the middleware does not say when they came'
+    assert all(began_ns < each.log_ns < time.time_ns() for each in recorded), 'the middleware does not report arrival times'
     assert len(re.findall(r'\[WARN\]', node.log)) <= 1
     assert '[ERROR]' not in node.log
     assert 'Traceback' not in node.log
@@ -161,7 +161,7 @@ def test_everything_is_stored_and_unknown_counts_are_null(
 
 @newer
 def test_names_are_hidden_from_this_package_alone(tmp_path: Path) -> None:
-    """What Humble has is there, what came later is not; rclpy's own modules go on using it."""
+    """Humble's names are there, later ones are not; rclpy's own modules still use them."""
     environ = {**os.environ, **humble(tmp_path / 'humble', FAST_DDS)}
     for name, expected in (
         ('shadowhound_data_logger.probe', dict.fromkeys(IN_HUMBLE, '') | NOT_IN_HUMBLE),
@@ -174,7 +174,7 @@ def test_names_are_hidden_from_this_package_alone(tmp_path: Path) -> None:
 
 
 def test_names_are_read_from_a_source_tree(tmp_path: Path) -> None:
-    """Those of modules, classes and members, in Python and in C++, and what a take tells of a message."""
+    """Those of modules, classes and members, in Python and in C++, and the fields that a take returns."""
     tree = tmp_path / 'rclpy'
     for name, text in SOURCES.items():
         path = tree / name
@@ -201,7 +201,7 @@ def test_names_are_read_from_a_source_tree(tmp_path: Path) -> None:
 
 
 def test_the_names_of_an_installed_rclpy_are_those_that_it_has() -> None:
-    """Read from its source, they are what Python finds: no name is invented, and none overlooked."""
+    """The names read from its source are those that Python finds: none invented, none missing."""
     for name in ('rclpy.node', 'rclpy.qos', 'rclpy.subscription', 'rclpy.utilities', 'rclpy.executors'):
         module = import_module(name)
         assert module.__file__

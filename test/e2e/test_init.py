@@ -1,4 +1,4 @@
-"""``init`` on a graph with a robot that is not ours: its file logs each topic that has a rule."""
+"""``init`` on a graph with a robot of another vendor: its file logs each topic that has a rule."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def publish(publishers: dict[str, Publisher]) -> None:
 def test_the_file_that_init_writes_logs_the_robot(
     shared: Processes, publishers: dict[str, Publisher], seaweed: Tower, tmp_path: Path
 ) -> None:
-    """Rates, sizes and what is left out are in comments; a node with the file receives and stores what is published then."""
+    """Rates, sizes and skipped topics are in comments; a node with the file receives and stores what is published then."""
     path = tmp_path / 'robot.yaml'
     with ThreadPoolExecutor(1) as pool:
         asking = pool.submit(init, shared, '--namespace', NS, '--duration', '1', '--to', str(path))
@@ -77,7 +77,7 @@ def test_the_file_that_init_writes_logs_the_robot(
 
 
 def test_without_topics_init_reports_an_error(shared: Processes) -> None:
-    """It says so, and that is a finding; for programs as well."""
+    """The error is also a finding, and in the JSON output."""
     ran = init(shared, '--namespace', '/nobody', '--duration', '1')
     assert ran.returncode == 1
     assert 'No topic has a publisher' in ran.stderr

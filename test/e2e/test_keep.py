@@ -1,4 +1,4 @@
-"""The story of docs/keep.md: a robot keeps everything, and the commands of the page bring what is wanted, to a dataset."""
+"""The example of docs/keep.md: a robot keeps everything, and the page's commands turn requested data into a dataset."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ ROOT: Final = Path(__file__).parents[2]
 MAIN: Final = [sys.executable, '-m', 'shadowhound_data_logger.cli.main']
 PAGE: Final = (ROOT / 'docs/keep.md').read_text(encoding='utf-8')
 NEAR: Final = '--near=-0.6,3.1,2'
-"""Where the door of the page is."""
+"""The position of the page's door."""
 FRAMES: Final = 200
 
 
 def settings() -> dict[str, Any]:
-    """Those of the page, as flat parameters."""
+    """Those on the page, as flat parameters."""
     block = re.search(r'```yaml\n(.*?)```', PAGE, re.DOTALL)
     assert block
     found: dict[str, Any] = {}
@@ -46,13 +46,13 @@ def settings() -> dict[str, Any]:
 
 
 def commands() -> list[list[str]]:
-    """Those of the patrol, in their order."""
+    """Those of the patrol, in order."""
     told = PAGE.partition('## A patrol')[2].partition('\n## ')[0]
     return [shlex.split(line) for line in re.findall(r'`shadowhound-data ([^`]+)`', told.replace('\n   ', ' '))]
 
 
 def patrols(processes: Processes, node: Node) -> None:
-    """A mission in which enough is kept."""
+    """A mission with enough kept data."""
     logger = MissionDataLogger(home=node.home, robot=processes.robot, experiment='thor_missions', start_timeout_s=30.0)
     try:
         logger.start_mission('patrol', f'look after the door with {processes.robot}')
@@ -69,7 +69,7 @@ def patrols(processes: Processes, node: Node) -> None:
 def test_the_commands_of_the_page_on_keeping_data_work(  # noqa: PLR0915 - one story
     processes: Processes, tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the settings of the page its commands do what it says, one after the other."""
+    """With the page's settings its commands do what they should, in order."""
     environ = {**tower.environment(), 'SHADOWHOUND_HOME': str(tmp_path / 'spark'), 'SHADOWHOUND_ROBOT': processes.robot}
     for name, value in environ.items():
         monkeypatch.setenv(name, value)
@@ -90,7 +90,7 @@ def test_the_commands_of_the_page_on_keeping_data_work(  # noqa: PLR0915 - one s
     processes.sim('image_raw:=false', GENTLE)
     patrols(processes, node)
     poll, sheet, ask, fetch, export = commands()
-    # What the robot keeps is known within seconds, while none of it has been sent.
+    # The kept data is known within seconds, while none of it has been sent.
     until(lambda: run(poll, '--json')['objects'] > 5, 'the rows have arrived')
     offer = run(poll, '--json')
     assert offer['lost'] == {}

@@ -1,4 +1,4 @@
-"""What a robot keeps is requested from its live page in a real Chromium, and arrives in the store."""
+"""Kept data of a robot is requested from its live page in a real Chromium, and arrives in the store."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KEPT = {
 
 
 def test_an_operator_requests_what_is_kept(processes: Processes, browser: Browser) -> None:
-    """The page says how much is kept of the selected time; a request sends it, and the page follows it to its end."""
+    """The page shows how much is kept of the selected time; a request sends it, and the page follows it to its end."""
     node = processes.node(None, KEPT)
     processes.sim('image_raw:=false', GENTLE)
     until(lambda: len([*(node.home / 'spool/kept').rglob('*.tar')]) >= 10, 'archives of images are kept')

@@ -25,7 +25,7 @@ def received(node: Node) -> dict[str, int]:
 
 @pytest.mark.long('a kill')
 def test_the_next_node_frees_the_shared_memory_of_a_killed_one(processes: Processes) -> None:
-    """And that of nobody who lives."""
+    """But not that of a running process."""
     other, dead = processes.node(home='other', robot='other'), processes.node()
     segments = {node: set(re.findall(rf'{FOLDER}/fast(?:dds|rtps)_[0-9a-f]{{16}}\b', _maps(node))) for node in (other, dead)}
     owned = segments[dead] - segments[other]
@@ -43,7 +43,7 @@ def test_the_next_node_frees_the_shared_memory_of_a_killed_one(processes: Proces
 
 @pytest.mark.long('a node')
 def test_a_node_has_the_shared_memory_that_it_frees(processes: Processes) -> None:
-    """It is freed first: a container has 64 MB, of which one that was killed may have left 36."""
+    """It is freed first: a container has 64 MB, and a killed node may occupy 36 of them."""
     mine = ['unshare', '--mount', 'mount', '-t', 'tmpfs', 'tmpfs', str(FOLDER)]
     if (tried := subprocess.run(mine, capture_output=True, text=True, check=False)).returncode:
         pytest.skip(f'no file system of our own here: {tried.stderr}')
@@ -56,7 +56,7 @@ def test_a_node_has_the_shared_memory_that_it_frees(processes: Processes) -> Non
 
 @pytest.mark.long('a kill')
 def test_a_killed_node_blocks_no_publisher(processes: Processes) -> None:
-    """Though it dies while it processes a message: who looks after its ports tells Fast DDS before that looks."""
+    """Even if it is killed while it processes a message: whatever checks its ports notifies Fast DDS first."""
     node = processes.node()
     if not (ports := ports_of(node.popen.pid)):
         pytest.skip('this middleware has no ports in shared memory')

@@ -1,4 +1,4 @@
-"""A node whose large index is damaged finds it while it logs, exits, and logs with a rebuilt one after its next start."""
+"""A node with a large damaged index finds the damage while it logs, exits, and logs with a rebuilt one after its restart."""
 
 from __future__ import annotations
 

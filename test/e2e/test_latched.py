@@ -1,4 +1,4 @@
-"""Each bag of the node begins with what is latched, as if it were the only one: events and bags that follow others as well."""
+"""Each bag of the node starts with the latched messages, as if it were the only one: events and later bags as well."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def latched(bag: Bag) -> list[tuple[str, str]]:
 def test_latched_messages_are_at_the_start_of_every_bag(
     processes: Processes, seaweed: Tower, store: ObjectStore, station: Station
 ) -> None:
-    """The last message of both publishers of a topic, and of one that a sensor takes too; nothing of it counts as missed."""
+    """The last message of both publishers of a topic, and of one with a sensor too; none of them count as missed."""
     node = processes.node(seaweed.environment(), PARAMETERS)
 
     def recorded(topic: str) -> int:
@@ -41,8 +41,8 @@ def test_latched_messages_are_at_the_start_of_every_bag(
     for publisher in publishers.values():
         publisher.create(STATIC, STRING, latched=True, depth=1)
         publisher.matched(STATIC)
-    # One after the other: of a depth of 1, the next message replaces one that is not delivered yet. And in turns: a middleware
-    # that does not name publishers leaves the ring of the events the last two messages, whoever sent them.
+    # In sequence: with a depth of 1, the next message replaces one that is not delivered yet. Alternating: with a middleware
+    # that does not name publishers the events' ring keeps the last two messages, whichever publisher sent them.
     for count, text in enumerate(['left before', 'right before', 'left', 'right'], 1):
         publishers[text.split()[0]].publish(STATIC, texts([text]))
         until(lambda count=count: recorded(STATIC) == count, f'{text!r} is recorded')
@@ -77,7 +77,7 @@ def test_latched_messages_are_at_the_start_of_every_bag(
     talked = [each for bag in (first, mission, last) for each in bag.messages() if each.topic == TALK]
     assert [int(decode(STRING, each.cdr).data) for each in talked] == list(range(40))
     for row in (*ledger['bags'].values(), *ledger['events'].values()):
-        assert not row['missed']  # not known where publishers have no names
+        assert not row['missed']  # unknown if publishers have no names
         assert (row['open'], row['received']) == (0, row['stored'])
 
 
@@ -100,7 +100,7 @@ def test_each_slice_can_be_played_on_its_own(processes: Processes, seaweed: Towe
     publisher.matched(TALK)
     for part in range(3):
         publisher.publish(TALK, texts(range(10 * part, 10 * part + 10)), 0.01)
-        until(lambda part=part: recorded(TALK) == 10 * part + 10, 'all that was said is recorded')
+        until(lambda part=part: recorded(TALK) == 10 * part + 10, 'all messages are recorded')
         assert station.bag('split')[0]
     ledger = node.stop()
     (bag,) = bags(store, processes.robot, processes.folder / 'bags')

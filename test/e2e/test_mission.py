@@ -1,4 +1,4 @@
-"""A mission next to a running node: the robot's values are logged to it, and objects of its time carry its id."""
+"""A mission next to a running node: the robot's values are logged to it, and objects from its time have its id."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ from shadowhound_data_logger.stores.s3 import S3Store
 
 ENOUGH = 40
 MOMENT_NS = 20 * 10**9
-"""In which the node notices a mission's beginning and end, on a machine that has much else to do."""
+"""The time in which the node notices a mission's start and end on a busy machine."""
 PARAMETERS = {'mission.capture': 'mission', 'mission.frame_every_s': 1.0, 'lowstate.batch_s': 1.0}
 
 
 def total(node: Node, what: str) -> int:
-    """Over all topics of the ledger."""
+    """The sum over all topics of the ledger."""
     rows = node.ledger()['topics'].values()
     return sum(sum(row[what].values()) if isinstance(row[what], dict) else row[what] for row in rows)
 
 
 def heard(station: Station) -> list[dict[str, Any]]:
-    """What ``~/mission`` says, to one who comes late."""
+    """What ``~/mission`` publishes, for a late subscriber."""
     found: list[str] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     subscription = station.node.create_subscription(
         String, f'{NODE}/mission', lambda message: found.append(message.data), latched
     )
     try:
-        until(lambda: station._executor.spin_once(timeout_sec=0.1) or found, '~/mission says something')
+        until(lambda: station._executor.spin_once(timeout_sec=0.1) or found, 'a message on ~/mission')
     finally:
         station.node.destroy_subscription(subscription)
     return [json.loads(text) if text else {} for text in found]
 
 
 def sees(folder: MissionFolder) -> bool:
-    """Whether the node logged all that it should by now."""
+    """Whether the node has logged everything expected by now."""
     story = state_of(folder).node
     assert story
     return story.last.get('distance_traveled_m', 0.0) > 0.5 and 'battery_pct' in story.last and story.counts['frame'] >= 2
@@ -60,13 +60,13 @@ def sees(folder: MissionFolder) -> bool:
 def test_only_mission_data_is_stored(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects], tmp_path: Path
 ) -> None:
-    """With ``mission.capture: mission`` all objects are of the mission's time and say so; the rest is counted as skipped."""
+    """With ``mission.capture: mission`` all objects are from the mission's time and marked; other messages count as skipped."""
     node = processes.node(seaweed.environment(), PARAMETERS)
     processes.sim('duration_s:=60.0', GENTLE)
     station = Station(processes.environ)
     logger = MissionDataLogger(home=node.home, robot=processes.robot, replay=False, start_timeout_s=0.0)
     try:
-        until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, 'the robot is heard')
+        until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, "the robot's messages are received")
         assert total(node, 'stored') == 0
         assert heard(station) == [{}]
         mission_id = logger.start_mission('patrol', 'go round')
@@ -77,7 +77,7 @@ def test_only_mission_data_is_stored(
         logger.end_mission(True, 0.0, 0.0)
         logger.flush(0.0)
         until(lambda: not journal.is_locked(folder.node.journal), 'the node leaves')
-        until(lambda: heard(station) == [{}], 'and says so')
+        until(lambda: heard(station) == [{}], 'the end of the mission is published')
         node.received('/imu', node.topic('/imu')['received'] + ENOUGH)
         until(lambda: not node.ledger()['objects']['pending'] and not total(node, 'open'), 'all is delivered')
         count = total(node, 'stored')
@@ -100,14 +100,14 @@ def test_only_mission_data_is_stored(
 @pytest.mark.slow
 @pytest.mark.long('half a minute')
 def test_a_run_has_what_the_node_measured(processes: Processes, tower: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A real MLflow server has the whole mission of an agent that only starts and ends it, and the objects name its run."""
+    """A real MLflow server has the complete mission of an agent that only starts and ends it, and the objects name its run."""
     environ = tower.environment()
     for name, value in environ.items():
         monkeypatch.setenv(name, value)
     node = processes.node(environ, {**PARAMETERS, 'mission.capture': 'always'})
     processes.sim('duration_s:=60.0', GENTLE)
     logger = MissionDataLogger(home=node.home, robot=processes.robot, experiment='thor_missions', start_timeout_s=30.0)
-    until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, 'the robot is heard')
+    until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, "the robot's messages are received")
     run_id = logger.start_mission('patrol', command := f'by the node of {processes.robot}')
     (folder,) = missions(node.home)
     status = node.home / 'spool' / f'status-{processes.robot}.json'

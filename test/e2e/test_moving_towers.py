@@ -1,4 +1,4 @@
-"""The way from one Tower to another in docs/tower.md: side by side, by rclone, verified by the catalog."""
+"""Moving from one Tower to another as in docs/tower.md: side by side, with rclone, verified by the catalog."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def remote(name: str, tower: Tower) -> dict[str, str]:
 
 @dataclass
 class Towers:
-    """An old one with what a robot stored, and a new one that is empty."""
+    """An old one with a robot's data, and a new empty one."""
 
     old: Tower
     new: Tower
@@ -77,7 +77,7 @@ class Towers:
             add_part(store, rows, name, self.tmp / 'tmp')
 
     def copy(self) -> str:
-        """By the command of the manual; what rclone said."""
+        """With the documented command; rclone's output."""
         said = re.search(r'^ +(rclone copy .*) old:sensor-data new:sensor-data$', DOCS.read_text(encoding='utf-8'), re.MULTILINE)
         assert said
         ours = {name: value for name, value in os.environ.items() if not name.startswith(('AWS_', 'RCLONE_'))}
@@ -90,13 +90,13 @@ class Towers:
         return ''.join(each.stderr for each in ran)
 
     def run(self, tower: Tower, *arguments: str) -> tuple[int, dict[str, Any]]:
-        """A verb of ours, asked of one of the two."""
+        """A command of ours, with one of the two as the store."""
         environ = {**tower.environment(), 'AWS_CA_BUNDLE': None}
         found = CliRunner().invoke(cli, [*arguments, '--json'], env=environ, standalone_mode=False, catch_exceptions=False)
         return found.return_value, json.loads(found.stdout)
 
     def verify(self, *arguments: str) -> dict[str, list[str]]:
-        """Of the new one: kind -> keys."""
+        """Verification of the new one: kind -> keys."""
         code, said = self.run(self.new, 'lake', 'verify', *arguments)
         assert code == (1 if said['findings'] else 0)
         return {kind: [one['key'] for one in piled['first']] for kind, piled in said['findings'].items()}
@@ -118,7 +118,7 @@ def towers(tmp_path: Path) -> Iterator[Towers]:
 
 
 def test_a_tower_is_moved_as_documented(towers: Towers) -> None:
-    """All of every object arrives, once; what robots send to the new one meanwhile stays; what the new one loses is named."""
+    """Every object arrives completely, once; objects that robots send to the new one stay; losses on the new one are named."""
     towers.copy()
     new = client(towers.new)
     for (bucket, key), body in BODIES.items():

@@ -1,4 +1,4 @@
-"""The node as its operator meets it: how it stops, what it refuses, and what it makes of a robot's oddities."""
+"""The node from its operator's view: how it stops, what it refuses, and how it handles a robot's peculiarities."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from e2e.wire import HANG, PASS, Wire
 from shadowhound_tower.embedded import Tower
 
 TALK = {'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 600.0}
-"""A batch that no test sees the end of: it is open until the node closes it."""
+"""A batch that does not end during a test: it is open until the node closes it."""
 COUNT = 50
 
 
@@ -32,7 +32,7 @@ COUNT = 50
 def test_a_signal_closes_the_open_batches(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects], number: int
 ) -> None:
-    """What was received is stored, delivered and accounted for when the node has ended, with exit code 0."""
+    """Everything received is stored, delivered and accounted for when the node has exited, with exit code 0."""
     node, publisher = processes.node(seaweed.environment(), TALK), processes.publisher()
     publisher.create('/talk', STRING)
     publisher.matched('/talk')
@@ -46,7 +46,7 @@ def test_a_signal_closes_the_open_batches(
 
 
 def test_systemd_is_notified_of_the_state(processes: Processes, seaweed: Tower, tmp_path: Path) -> None:
-    """As a service it says when it is ready, that it lives, and that it stops."""
+    """As a service it reports when it is ready, that it is alive, and that it stops."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / 'notify'))
         systemd.settimeout(60.0)
@@ -61,7 +61,7 @@ def test_systemd_is_notified_of_the_state(processes: Processes, seaweed: Tower, 
 
 
 def test_the_next_start_delivers_the_rest(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
-    """A stop while the store is away keeps everything in the spool, and says so; the next start delivers it."""
+    """A stop while the store is unreachable keeps everything in the spool, and reports it; the next start delivers it."""
     with Wire(seaweed.endpoint_url) as wire:
         wire.set((500, 'InternalError'))
         environ = {**seaweed.environment(), 'AWS_ENDPOINT_URL': wire.url}
@@ -79,7 +79,7 @@ def test_the_next_start_delivers_the_rest(processes: Processes, seaweed: Tower, 
 
 @pytest.mark.long('a node of its own that hangs')
 def test_a_second_signal_exits_immediately(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
-    """While it drains to a hung server, a second signal a second later ends it, and what is spooled is delivered later."""
+    """While it drains to a hung server, a second signal after a second stops it, and spooled data is delivered later."""
     with Wire(seaweed.endpoint_url) as wire:
         wire.set(HANG)
         environ = {**seaweed.environment(), 'AWS_ENDPOINT_URL': wire.url}
@@ -92,7 +92,7 @@ def test_a_second_signal_exits_immediately(processes: Processes, seaweed: Tower,
         node.signal(signal.SIGINT)  # the same key press
         until(lambda: node.topic('/talk')['stored'] == COUNT, 'the open batch is durable')
         said_s = time.monotonic()
-        until(lambda: time.monotonic() > said_s + 1.1, 'the second that tells a second signal from an echo')
+        until(lambda: time.monotonic() > said_s + 1.1, 'the second that distinguishes a second signal from an echo')
         assert node.popen.poll() is None
         node.signal(signal.SIGINT)
         assert node.wait() == 128 + signal.SIGINT
@@ -103,7 +103,7 @@ def test_a_second_signal_exits_immediately(processes: Processes, seaweed: Tower,
 
 
 def test_without_a_server_the_store_is_a_folder(processes: Processes) -> None:
-    """With nothing set the data goes to a folder of the same layout, and the node says where."""
+    """Without settings the data is written to a folder with the same layout, and the node reports where."""
     node, publisher = processes.node(None, TALK), processes.publisher()
     publisher.create('/talk', STRING)
     publisher.matched('/talk')
@@ -135,25 +135,25 @@ def test_a_wrong_parameter_refuses_the_start(processes: Processes, parameters: d
     node = processes.node(None, parameters, ready=False)
     assert node.wait() == 2, node.log
     lines = [each for each in node.log.splitlines() if not each.startswith('[INFO]')]
-    (line,) = (each for each in lines if 'left in shared memory' not in each)  # by the killed nodes of other tests
+    (line,) = (each for each in lines if 'left in shared memory' not in each)  # left by the killed nodes of other tests
     for word in words:
         assert word in line
     assert not (node.home / 'spool').exists()
 
 
 def test_an_invalid_parameter_file_refuses_the_start(processes: Processes) -> None:
-    """A parameter file that cannot be read refuses the start as well, without a traceback."""
+    """A parameter file that cannot be read prevents the start as well, without a traceback."""
     node = processes.node(None, {}, '--params-file', '/nonexistent.yaml', ready=False)
     assert node.wait() == 2, node.log
     assert '/nonexistent.yaml' in node.log
     assert 'Traceback' not in node.log
 
 
-# -- a robot's oddities ------------------------------------------------------------------------------------------------
+# -- peculiarities of a robot ------------------------------------------------------------------------------------------
 
 
 def test_a_namespace_names_the_robot(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
-    """In a namespace topics are below it, and it leads the keys."""
+    """In a namespace, topics are below it, and keys start with it."""
     robot = f'tachi_{processes.robot}'
     node = processes.node(seaweed.environment(), TALK, '-r', f'__ns:=/{robot}', robot='')
     publisher = processes.publisher()
@@ -168,7 +168,7 @@ def test_a_namespace_names_the_robot(processes: Processes, seaweed: Tower, store
 
 
 def without_go2_interfaces() -> dict[str, str]:
-    """The variables of an environment in which that package is not installed."""
+    """The variables of an environment without that package."""
     return {
         name: os.pathsep.join(part for part in os.environ.get(name, '').split(os.pathsep) if 'go2_interfaces' not in part)
         for name in ('AMENT_PREFIX_PATH', 'PYTHONPATH')
@@ -180,7 +180,7 @@ HIDE_GO2 = "import sys\nsys.modules['go2_interfaces'] = None\n"
 
 @pytest.mark.long('a node of its own')
 def test_without_go2_interfaces_only_its_topics_are_affected(processes: Processes, tmp_path: Path) -> None:
-    """Its topics cost one warning each, and the others go on."""
+    """Its topics log one warning each, and the others continue."""
     (tmp_path / 'hidden').mkdir()
     (tmp_path / 'hidden' / 'sitecustomize.py').write_text(HIDE_GO2)
     environ = without_go2_interfaces()
@@ -217,7 +217,7 @@ def cloud(points: list[tuple[float, float, float]], **layout: int) -> bytes:
 def test_malformed_messages_are_rejected_and_counted(
     processes: Processes, seaweed: Tower, stored: Callable[..., Objects]
 ) -> None:
-    """What cannot be read is rejected by reason and counted, what has no encoder is stored as serialized, under its true date."""
+    """Unreadable messages are rejected by reason and counted, those without an encoder are stored serialized, with their date."""
     jpeg, image = 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image'
     good = simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8))
     nan = float('nan')

@@ -1,6 +1,6 @@
-"""Robots without any settings: a wheeled base, a drone in a namespace, an arm, and a Unitree with its own topics on Cyclone DDS.
+"""Robots without any settings: a wheeled base, a drone in a namespace, an arm, and a Unitree with vendor topics on Cyclone DDS.
 
-What has cameras walks for some seconds as a mission, which is then exported as a LeRobot dataset.
+Those with cameras walk for some seconds as a mission, which is then exported as a LeRobot dataset.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FIELDS: Mapping[str, Mapping[str, Any]] = {
 
 
 def test_every_type_with_a_rule_is_logged(processes: Processes) -> None:
-    """Each message of it is stored or left out by the rate, and none is rejected."""
+    """Each message of it is stored or skipped by the rate, and none is rejected."""
     kinds = [kind for kind in RULES if not is_of_unitree(kind) and find_spec(kind.partition('/')[0])]
     assert len(kinds) > 50
     topics = {f'/topic_{number}': Sent(kind, FIELDS.get(kind, {}), 8, f'topic_{number}') for number, kind in enumerate(kinds)}
@@ -52,7 +52,7 @@ def test_every_type_with_a_rule_is_logged(processes: Processes) -> None:
 
 
 def test_a_wheeled_base(processes: Processes, browser: Browser, tmp_path: Path) -> None:
-    """Like a TurtleBot 4: everything that has a rule is stored and shown, and the example of a mapping file exports it."""
+    """Like a TurtleBot 4: everything with a rule is stored and shown, and the example mapping file exports it."""
     robot = Robot(processes, BASE, robot='tb4', mission='tb4')
     with robot.walking():
         page = robot.shown(
@@ -71,7 +71,7 @@ def test_a_wheeled_base(processes: Processes, browser: Browser, tmp_path: Path) 
 
 
 def test_a_drone_is_logged_with_its_gps(processes: Processes, browser: Browser, tmp_path: Path) -> None:
-    """In a namespace: its name, its GPS in each object, and --near-gps finds what it recorded there."""
+    """In a namespace: its name, its GPS position in each object, and --near-gps finds its recordings there."""
     robot = Robot(processes, DRONE, '-r', '__ns:=/drone1', robot='', mission='drone1')
     with robot.walking():
         page = robot.shown(
@@ -102,7 +102,7 @@ def test_a_drone_is_logged_with_its_gps(processes: Processes, browser: Browser, 
 
 
 def test_an_arm_is_logged_without_a_place(processes: Processes, browser: Browser, tmp_path: Path) -> None:
-    """Joints, the camera at its wrist, its description and its commands; it has no place, and so it is drawn at the origin."""
+    """Joints, the wrist camera, its description and its commands; it has no position, and so it is drawn at the origin."""
     robot = Robot(processes, ARM, robot='ur5', mission='ur5')
     with robot.walking():
         page = robot.shown(browser, 'Camera', '3D view', 'Joints', 'Diagnostics', 'Log', drawn=('camera', 'model', 'joints'))
@@ -131,22 +131,22 @@ def test_an_arm_is_logged_without_a_place(processes: Processes, browser: Browser
 
 
 def assert_no_unitree(robot: Robot) -> None:
-    """While it runs: its status, /diagnostics and the page's table name no topic but its own."""
+    """While it runs: its status, /diagnostics and the page's table contain no other topics."""
     report = robot.ask('status')
     names = {topic for topic, each in robot.topics.items() if each.sensor}
     assert report['topics'].keys() == names, report['topics'].keys() ^ names
 
 
 def assert_logs_itself_alone(robot: Robot, ledger: Mapping[str, Any]) -> None:
-    """The ledger too."""
+    """In the ledger, too."""
     assert ledger['topics'].keys() == {topic for topic, each in robot.topics.items() if each.sensor}
 
 
 @pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')
 def test_a_unitree_is_logged_from_its_own_topics(processes: Processes, browser: Browser, tmp_path: Path) -> None:
-    """Through Cyclone DDS, without the driver: the sensors of a Go2 are taken from them, and the battery is known.
+    """Through Cyclone DDS, without the driver: they serve as the sensors of a Go2, and the battery is known.
 
-    Messages of unitree_go need the package; without it the log says how to build it, and all else is stored.
+    Messages of unitree_go need the package; without it the log explains how to build it, and everything else is stored.
     """
     has_package = find_spec('unitree_go') is not None
     robot = Robot(processes, unitree(has_package=has_package), robot='go2', mission='go2', cyclone=True)
@@ -173,7 +173,7 @@ def test_a_unitree_is_logged_from_its_own_topics(processes: Processes, browser: 
 
 
 def test_two_robots_in_one_graph_are_logged_separately(processes: Processes) -> None:
-    """A node in the namespace of each logs that robot alone, under its name; one without says what to start instead."""
+    """A node in the namespace of each logs that robot alone, under its name; one without reports what to start instead."""
     names, kinds = ('robot0', 'robot1'), {'odom': 'nav_msgs/msg/Odometry', 'imu': 'sensor_msgs/msg/Imu',
                                           'joint_states': 'sensor_msgs/msg/JointState'}  # fmt: skip
     publisher = processes.publisher()
@@ -196,7 +196,7 @@ def test_two_robots_in_one_graph_are_logged_separately(processes: Processes) -> 
     store = nodes[0].home / 'store' / 'sensor-data'
     until(lambda: {path.name for path in store.iterdir()} == set(names), 'the other node takes over the uploads')
     until(lambda: {path.name for path in (store / 'robot1').iterdir()} >= {'imu', 'odom', 'joints'}, 'what it uploads')
-    ledger = nodes[1].stop()  # of both: they share a spool
+    ledger = nodes[1].stop()  # of both, since they share a spool
     assert {topic: row['received'] for topic, row in ledger['topics'].items() if row['received']} == {
         f'/{name}/{topic}': count for name, count in zip(names, (5, 7), strict=True) for topic in kinds
     }

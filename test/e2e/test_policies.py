@@ -1,6 +1,6 @@
-"""Three robots and one registry: who takes what, and who goes back; MLflow, SeaweedFS, DDS and the verbs are real.
+"""Three robots and one registry: which robot takes which policy, and rollbacks; with real MLflow, SeaweedFS, DDS and commands.
 
-The way of a policy from Spark to a robot and out again, against a real MLflow server and a real SeaweedFS.
+A policy's path from Spark to a robot and back out, with a real MLflow server and a real SeaweedFS.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from shadowhound_data_logger.policies.smoke import ISOLATIONS
 from shadowhound_data_logger.ros.policy_topics import NODE
 
 ROUNDS = 5
-"""Rollbacks that are timed: one may meet a machine that does other things."""
+"""Timed rollbacks: one may coincide with other load on the machine."""
 
 
 class Robot:
-    """A home, and what is done there by the verbs."""
+    """A home, and commands that run on it."""
 
     def __init__(self, name: str, home: Path, spark: Spark, environ: dict[str, str]) -> None:
         self.environ = {**environ, 'SHADOWHOUND_HOME': str(home), 'SHADOWHOUND_ROBOT': name, 'SHADOWHOUND_POLICY': spark.name}
@@ -47,20 +47,20 @@ class Robot:
         spark.trusted_by(self.folder)
 
     def verb(self, *arguments: str, code: int = 0) -> Any:
-        """What it prints, of JSON what that says."""
+        """Its output, parsed if it is JSON."""
         done = CliRunner().invoke(cli, ['policy', *arguments], env=self.environ, standalone_mode=False, catch_exceptions=False)
         assert (done.return_value or 0) == code, done.output
         return json.loads(done.output) if '--json' in arguments else done.output
 
     def synced(self) -> tuple[str, str]:
-        """What a look at the registry, as from cron, comes to."""
+        """The result of one check of the registry, as from cron."""
         told = self.verb('sync', '--json')
         return told['done'], told['active']
 
 
 @pytest.fixture
 def speaker() -> Iterator[tuple[int, Callable[[str], object]]]:
-    """A domain, and what says something to the policy service in it."""
+    """A domain, and a client of its policy service."""
     with free_domain() as domain:
         context = rclpy.Context()
         rclpy.init(context=context, domain_id=domain)
@@ -112,7 +112,7 @@ def test_a_service_stops_immediately_during_a_download(tower: Tower, tmp_path: P
 def test_a_canary_updates_first_and_rolls_back_alone(  # noqa: PLR0915 - one story
     tower: Tower, tmp_path: Path, speaker: tuple[int, Callable[[str], object]]
 ) -> None:
-    """A version that misbehaves on the canary is out within a second, and stays out; the next one all of them follow."""
+    """A version that misbehaves on the canary is rolled back within a second, and stays so; all robots take the next one."""
     bucket_of(tower)
     domain, say = speaker
     spark = Spark(tmp_path / 'spark', f'patrol_{uuid4().hex[:8]}')
@@ -123,7 +123,7 @@ def test_a_canary_updates_first_and_rolls_back_alone(  # noqa: PLR0915 - one sto
     ids: dict[int, str] = {}
 
     def publish(version: int, *arguments: str) -> None:
-        """A new version, or another alias for one that is there."""
+        """Publish a new version, or another alias for an existing one."""
         if version not in ids:
             ids[version] = spark.packed(version, linear(0.1 * version))[1].id
         of_spark.verb('publish', str(spark.folder / f'packed_{version}'), '--alias', *arguments)
@@ -148,7 +148,7 @@ def test_a_canary_updates_first_and_rolls_back_alone(  # noqa: PLR0915 - one sto
             until(lambda: tachi.folder.current() == ids[1], lambda: f'it goes back: {service.log}')
             took_s.append(time.monotonic() - began)
         assert statistics.median(took_s) < 1.0, took_s
-        service.await_log(f'{ids[2]} was rolled back here: 4 steps failed')  # the registry says the same, and is not followed
+        service.await_log(f'{ids[2]} was rolled back here: 4 steps failed')  # the registry is unchanged, and is not followed
         assert tachi.folder.current() == ids[1]
         assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
         assert [robot.folder.state.read().bad for robot in others] == [{}, {}]
@@ -180,8 +180,8 @@ def test_a_canary_updates_first_and_rolls_back_alone(  # noqa: PLR0915 - one sto
 @pytest.mark.seaweedfs
 @pytest.mark.long('an MLflow server, and a process for each smoke run')
 def test_a_policy_is_published_activated_and_rolled_back(tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keys, pack and publish on Spark; sync, list, show, rollback, use, pin and unpin on Thor; all by the verbs."""
-    monkeypatch.setattr(registry, 'PAGE', 1)  # as many answers as there are versions
+    """Keys, pack and publish on Spark; sync, list, show, rollback, use, pin and unpin on Thor; all with the commands."""
+    monkeypatch.setattr(registry, 'PAGE', 1)  # as many responses as there are versions
     client = bucket_of(tower)
     name = f'patrol_{uuid4().hex[:8]}'
     spark = tower.environment('spark') | tower.tracking('spark') | {'SHADOWHOUND_HOME': str(tmp_path / 'spark_home')}
@@ -194,7 +194,7 @@ def test_a_policy_is_published_activated_and_rolled_back(tower: Tower, tmp_path:
         return json.loads(done.output) if '--json' in arguments else done.output
 
     def packed(folder: str, gain: float, *arguments: str) -> str:
-        """The id of what is in the folder then."""
+        """The id of the folder's current contents."""
         of_training = trained(tmp_path / f'trained_{folder}', linear(gain))
         made = run(spark, 'pack', str(of_training), '--name', name, '--smoke', f'{of_training}.npz', '--max-p99-ms', '5000',
                    '--to', str(tmp_path / folder), '--json', *arguments)  # fmt: skip
@@ -223,7 +223,7 @@ def test_a_policy_is_published_activated_and_rolled_back(tower: Tower, tmp_path:
         assert policy.id == first
         assert [spec.names for spec in policy.manifest.inputs] == [('x', 'y', 'yaw')]
     second = publish(2)
-    run(spark, 'publish', str(tmp_path / 'packed_1'), '--alias', 'first')  # which is on the last page
+    run(spark, 'publish', str(tmp_path / 'packed_1'), '--alias', 'first')  # it is on the last page
     assert run(thor, 'sync', '--json')['active'] == second
     assert run(thor, 'sync', '--json')['done'] == 'unchanged'
     assert first in run(thor, 'rollback')

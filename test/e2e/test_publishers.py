@@ -22,14 +22,14 @@ COUNT = 300
 
 @dataclass(frozen=True, slots=True)
 class Listening:
-    """A node that listens, and what its store holds."""
+    """A node that subscribes, and the contents of its store."""
 
     processes: Processes
     node: Node
     stored: Callable[..., Objects]
 
     def numbers(self, sensor: str, least: int) -> list[int]:
-        """The numbers in the store once so many messages of the sensor are there; nothing of the topic was missed."""
+        """The numbers in the store once this many messages of the sensor are there; none of the topic were missed."""
         row = self.node.settled(f'/{sensor}', least)
         objects = self.stored(f'{self.processes.robot}/{sensor}')
         assert len(objects.samples(sensor)) == row['stored'] == row['received']
@@ -49,7 +49,7 @@ def listening(shared: Processes, seaweed: Tower, stored: Callable[..., Objects])
 
 @pytest.mark.long('kills')
 def test_a_publisher_is_counted_across_a_kill_and_restart(listening: Listening) -> None:
-    """The messages of both of its lives are stored once."""
+    """The messages before and after the restart are stored once."""
     for life in range(2):
         publisher = listening.processes.publisher()
         publisher.create('/killed', STRING)
@@ -61,7 +61,7 @@ def test_a_publisher_is_counted_across_a_kill_and_restart(listening: Listening) 
 
 
 def test_two_publishers_on_a_topic_are_stored_once(listening: Listening) -> None:
-    """The messages of both are stored once, where one is BEST_EFFORT and the other RELIABLE."""
+    """The messages of both are stored once, one BEST_EFFORT and the other RELIABLE."""
     both = [listening.processes.publisher() for _ in range(2)]
     for publisher, reliable in zip(both, (False, True), strict=True):
         publisher.create('/mixed', STRING, reliable=reliable)
@@ -73,7 +73,7 @@ def test_two_publishers_on_a_topic_are_stored_once(listening: Listening) -> None
 
 
 def test_a_node_stays_off_the_port_of_a_killed_one(processes: Processes, seaweed: Tower) -> None:
-    """Who still writes there may never notice that another one listens; at its own port it hears what is published."""
+    """A process still writing there may never notice a new reader; at its own port the node receives what is published."""
     parameters = {'sensors': ['killed'], 'killed.topics': ['killed'], 'killed.rate_hz': 0.0}
     node = processes.node(seaweed.environment(), parameters)
     publisher = processes.publisher()

@@ -1,6 +1,6 @@
-"""A camera whose driver publishes raw images only, and one that is compressed later: nothing is missed on either way.
+"""A camera with a driver that publishes raw images only, and one that is compressed later: neither misses any.
 
-That is so through shared memory. What UDP loses of raw images, beside a robot with another RMW, is counted.
+That holds for shared memory. Raw images lost over UDP, on a robot with another RMW, are counted.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def switched(node: Node, topic: str, times: int) -> None:
 
 @pytest.mark.long('twelve seconds of raw images')
 def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:
-    """30 raw images a second arrive, BEST_EFFORT and 921 KB each; compressed ones are taken as long as there are any."""
+    """30 raw images per second arrive, BEST_EFFORT and 921 KB each; compressed ones are used while they exist."""
     node = processes.node(seaweed.environment(), {'sensors': ['camera']})
     sim = processes.sim('compressed:=false')
     switched(node, RAW_TOPIC, 1)
@@ -41,7 +41,7 @@ def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored:
     republisher.matched(JPEG_TOPIC)
     republisher.publish(JPEG_TOPIC, [cdr(COMPRESSED, format='jpeg', data=jpeg)] * 60, 1 / 30)
     node.received(JPEG_TOPIC, 60)
-    assert node.topic(RAW_TOPIC)['received'] <= before + 60  # what came before it left, and was not durably counted yet
+    assert node.topic(RAW_TOPIC)['received'] <= before + 60  # from before it left, and not durably counted yet
     republisher.destroy(JPEG_TOPIC)
     switched(node, RAW_TOPIC, 2)
     node.received(RAW_TOPIC, before + FRAMES // 2)
@@ -66,11 +66,11 @@ def test_raw_images_are_not_missed(processes: Processes, seaweed: Tower, stored:
 @pytest.mark.slow
 @pytest.mark.long('a minute of raw images')
 def test_a_minute_of_raw_images_is_accounted_for(processes: Processes, seaweed: Tower) -> None:
-    """Of 1,800 raw images the node receives all but what a machine that is busy with other tests loses, and counts that."""
+    """Of 1,800 raw images the node receives all except what a busy machine loses, and counts the loss."""
     node = processes.node(seaweed.environment(), {'sensors': ['camera']})
     sim = processes.sim('compressed:=false', 'duration_s:=60.0')
     assert sim.wait(90) == 0
     row = node.stop()['topics'][RAW_TOPIC]
     assert row['missed'] <= 90
-    # The first second passes while it waits for a compressed topic.
+    # In the first second the sensor waits for a compressed topic.
     assert row['published'] == row['received'] + row['missed'] >= 1700

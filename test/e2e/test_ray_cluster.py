@@ -1,4 +1,4 @@
-"""A Ray cluster of two nodes in two networks answers from the tables as one process does, also when a node is killed."""
+"""A Ray cluster of two nodes in two networks returns the same from the tables as one process, also when a node is killed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ pytestmark = [
 
 
 class Cluster:
-    """Two nodes of one core each."""
+    """Two nodes with one core each."""
 
     def __init__(self, stack: ExitStack, machines: Machines) -> None:
         self._machines = machines
@@ -74,7 +74,7 @@ class Cluster:
         assert ran.returncode == 0, ran.stdout + ran.stderr
 
     def ask(self, table: str, options: dict[str, str], mark: Path | None = None) -> subprocess.Popen[str]:
-        """The driver on the first node. With ``mark``, tasks of the second one make that file and take longer."""
+        """The driver on the first node. With ``mark``, tasks of the second one create that file and take longer."""
         given = {'runner': HEAD, 'table': table, 'options': options, 'near': NEAR, 'mark': mark and str(mark)}
         return drive(given, inside(self._machines.robot), self._environ)
 
@@ -92,14 +92,14 @@ def drive(given: dict[str, Any], prefix: Sequence[str] = (), environ: dict[str, 
 
 
 def answer(process: subprocess.Popen[str]) -> Any:
-    """What the driver prints last."""
+    """The last line that the driver prints."""
     output, errors = process.communicate(timeout=240)
     assert process.returncode == 0, errors[-5000:]
     return json.loads(output.splitlines()[-1])
 
 
 def kill_all(pid: int) -> None:
-    """Each process in the network of this one, but itself."""
+    """Kill each other process in the network of this one."""
     network = Path(f'/proc/{pid}/ns/net').readlink()
     for each in Path('/proc').iterdir():
         with suppress(OSError):
@@ -109,7 +109,7 @@ def kill_all(pid: int) -> None:
 
 @contextmanager
 def relayed(listener: socket.socket, url: str) -> Iterator[str]:
-    """What connects there is connected to that server."""
+    """Forward connections to that server."""
     target = urlsplit(url)
     loop = asyncio.new_event_loop()
 
@@ -166,7 +166,7 @@ def source(tower: Tower, tmp_path: Path) -> tuple[Bucket, str]:
 
 
 def test_two_nodes_answer_as_one_process(source: tuple[Bucket, str], tmp_path: Path) -> None:
-    """As Daft in one process, and as ``query``; then again while the second node is killed in the middle of its work."""
+    """As Daft in one process, and as ``query``; then again while the second node is killed during its work."""
     bucket, root = source
     settings = bucket.settings
     options = {'endpoint_url': settings.endpoint_url, 'key_id': settings.access_key_id, 'access_key': settings.secret_access_key,

@@ -1,4 +1,4 @@
-"""A node whose room for what is kept is full: rate goes, time stays, whatever kills it."""
+"""A node without space for more kept data: the rate is reduced, the time span stays, also after kills."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def thinned(root: Path) -> int:
 
 
 def thins(root: Path, more: int) -> None:
-    """Wait until so many objects more are thinned."""
+    """Wait until this many more objects are thinned."""
     goal = more + (thinned(root) if (root / 'index.db').exists() else 0)
     until(lambda: thinned(root) >= goal, 'something is thinned')
 
@@ -45,7 +45,7 @@ def thins(root: Path, more: int) -> None:
 @pytest.mark.long('a robot for a minute, and six kills')
 @pytest.mark.timeout(900)
 def test_kept_data_is_thinned_before_the_oldest_is_evicted(processes: Processes) -> None:
-    """Killed again and again while it thins: nothing is evicted as a whole, each second stays, the ledger has every message."""
+    """Killed repeatedly while it thins: nothing is evicted completely, each second remains, the ledger has every message."""
     chance = random.Random(28)
     processes.sim('image_raw:=false')
     for _ in range(KILLS):

@@ -1,4 +1,4 @@
-"""Any thread of the real node fails or ends: detected within a second, restarted and counted; nothing is lost."""
+"""Any thread of the real node fails or exits: detected within a second, restarted and counted; nothing is lost."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ GROUP = 50
 
 @dataclass(frozen=True, slots=True)
 class Mortal:
-    """A node whose threads die on order, and somebody who publishes."""
+    """A node with threads that crash on request, and a publisher."""
 
     node: Node
     publisher: Publisher
     orders: Path
 
     def worker(self, name: str) -> tuple[int, WorkerStatus]:
-        """The boot clock of the status, ns, and the thread's part of it."""
+        """The boot clock of the status, ns, and its entry for the thread."""
         node = status.read(self.node.home / 'spool', self.node.robot, SystemClock.of_this_machine()).node
         return node.boot_ns, node.workers.get(name, WorkerStatus())
 
@@ -41,7 +41,7 @@ class Mortal:
         (self.orders / f'{name}.{way}').touch()
 
     def seen_after_s(self, name: str, way: str, failures: int) -> float:
-        """How long after the death the status tells of it."""
+        """The time from the crash until the status reports it."""
         boot_ns, row = until(lambda: found if (found := self.worker(name))[1].failures >= failures else None,
                              f'{name} is seen to die')  # fmt: skip
         died_ns = int((self.orders / f'{name}.{way}.done').read_text())
@@ -52,7 +52,7 @@ class Mortal:
 
 @pytest.fixture
 def mortal(processes: Processes, tmp_path: Path) -> Mortal:
-    """The drain lock's thread dies in its first round: it has no second one."""
+    """The thread of the drain lock crashes in its first round: it has no second one."""
     folder, orders = tmp_path / 'mortal', tmp_path / 'orders'
     folder.mkdir()
     orders.mkdir()
@@ -68,7 +68,7 @@ def mortal(processes: Processes, tmp_path: Path) -> Mortal:
 
 @pytest.mark.long('kills threads')
 def test_nothing_is_lost_when_any_thread_fails(mortal: Mortal) -> None:
-    """Twice each: of what its round raised, and of its own bookkeeping; in the end every message is delivered."""
+    """Twice each: in its round, and in its bookkeeping; in the end every message is delivered."""
     sent, seen_s = 0, [mortal.seen_after_s('upload-lock', 'thread', 1)]
     for failures, way in enumerate(('round', 'thread'), 1):
         for name in WORKERS:
@@ -84,13 +84,13 @@ def test_nothing_is_lost_when_any_thread_fails(mortal: Mortal) -> None:
         assert (last.alive, last.failures, last.deaths) == (True, 2, 1)
         assert f'{name} died (2 times so far) and tries again' in mortal.node.log
     assert statistics.median(seen_s) < 1.0, seen_s
-    assert max(seen_s) < 5.0, seen_s  # a machine that is busy with other things
+    assert max(seen_s) < 5.0, seen_s  # a busy machine
     mortal.node.stop()
 
 
 @pytest.mark.long('kills threads')
 def test_a_failure_of_the_main_loop_ends_the_node(mortal: Mortal) -> None:
-    """The node does not go on without it: it makes all durable, says why and ends with 1, and its service starts it again."""
+    """The node exits without it: it makes everything durable, reports the reason and exits with 1; its service restarts it."""
     mortal.publisher.publish('/talk', texts(range(GROUP)))
     mortal.node.received('/talk', GROUP)
     mortal.order('main', 'round')

@@ -38,7 +38,7 @@ print(run.info.run_id)
 @pytest.mark.timeout(900)
 @pytest.mark.skipif(not PYTHON.is_file(), reason=f'there is no torch at {PYTHON} (docs/development.md)')
 def test_a_model_is_found_by_what_it_was_trained_on(tmp_path: Path, tower: Tower) -> None:
-    """By any object that a value of its frames came from, and by no other."""
+    """By any object that contributed a value to its frames, and by no other."""
     house = House(tmp_path)
     for number in range(2):
         house.record(Mission(f'm{number}', begin_s=100 * number, seconds=3, sensors=('camera', 'odom')))
@@ -69,7 +69,7 @@ def test_a_model_is_found_by_what_it_was_trained_on(tmp_path: Path, tower: Tower
 @pytest.mark.long('starts an MLflow server')
 @pytest.mark.timeout(600)
 def test_a_run_is_found_while_the_mission_was_in_its_data(tmp_path: Path, tower: Tower) -> None:
-    """By each digest that the dataset had then: one that was trained before the mission came is not among them."""
+    """By each digest that the dataset had then: a run trained before the mission was added is not among them."""
     house = House(tmp_path)
     environ = {**os.environ, **tower.tracking('spark'), 'SHADOWHOUND_HOME': str(tmp_path), 'AWS_ENDPOINT_URL': '',
                'PYTHONPATH': str(ROOT)}  # fmt: skip

@@ -1,4 +1,4 @@
-"""A real node, real DDS: what is stored and reported of publishers whose stamps and arrivals differ."""
+"""A real node, real DDS: stored data and reports of publishers with stamps that differ from the arrivals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TYPE = 'nav_msgs/msg/Odometry'
 HZ, SECONDS = 20, 8
 SECOND = 10**9
 SKEWS = {'late': [146.0], 'apart': [0.0, 300.0], 'ahead': [-3600.0], 'fine': [0.0], 'stuck': [0.0]}
-"""Sensor -> how many seconds the stamps of each of its publishers are behind."""
+"""Sensor -> the delay of the stamps of each of its publishers in seconds."""
 
 
 def odometry(sensor: str, skew_s: float) -> Iterator[bytes]:
@@ -67,7 +67,7 @@ def objects(node: Node, shared: Processes, stored: Callable[..., Objects]) -> Ob
 
 @pytest.mark.long('publishers with clocks of their own')
 def test_both_times_of_each_object_are_stored(objects: Objects) -> None:
-    """Keys and ``t_start_ns`` have the stamps, however far they are off; the arrivals are beside them."""
+    """Keys and ``t_start_ns`` have the stamps, however wrong; the arrivals are stored next to them."""
     for name, skew_s in (('late', 146.0), ('ahead', -3600.0), ('fine', 0.0)):
         for key in objects.sensor(name):
             said = objects.infos[key].metadata
@@ -79,7 +79,7 @@ def test_both_times_of_each_object_are_stored(objects: Objects) -> None:
 
 @pytest.mark.long('publishers with clocks of their own')
 def test_publishers_on_different_clocks_are_sampled_separately(objects: Objects) -> None:
-    """One message per second of each: neither all of them, nor those of one clock alone."""
+    """One message per second from each: neither all of them, nor those of one clock alone."""
     times = [int(objects.infos[key].metadata['t_start_ns']) / SECOND for key in objects.sensor('apart')]
     newest = max(times)
     by_clock = [sum(newest - at < 150 for at in times), sum(newest - at >= 150 for at in times)]
@@ -88,7 +88,7 @@ def test_publishers_on_different_clocks_are_sampled_separately(objects: Objects)
 
 @pytest.mark.long('publishers with clocks of their own')
 def test_wrong_stamps_do_not_split_batches(objects: Objects) -> None:
-    """A constant offset, and a stamp that is stuck, do not break a topic into single messages."""
+    """A constant offset, and a stamp that is stuck, do not split a topic into single messages."""
     for name in ('late', 'ahead', 'fine', 'stuck'):
         assert SECONDS - 1 <= len(objects.sensor(name)) <= SECONDS + 3, name
     by_arrival = sum(int(objects.infos[key].metadata.get('by_arrival', 0)) for key in objects.sensor('stuck'))
@@ -97,7 +97,7 @@ def test_wrong_stamps_do_not_split_batches(objects: Objects) -> None:
 
 @pytest.mark.long('publishers with clocks of their own')
 def test_wrong_clocks_are_reported(node: Node, objects: Objects) -> None:
-    """By how much, with the likely cause; a topic that is fine is not mentioned."""
+    """With the offset and the likely cause; a topic without a problem is not mentioned."""
     assert objects.contents
 
     def findings() -> str:

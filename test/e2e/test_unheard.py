@@ -1,4 +1,4 @@
-"""A publisher that the robot's RMW finds and the node does not, as its profile looks elsewhere: an error until it is heard."""
+"""A publisher that the robot's RMW discovers and the node does not, due to its profile: an error until it is received."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def findings(node: Node) -> list[str]:
 
 @pytest.mark.long('twelve seconds of two machines')
 def test_a_publisher_where_our_profile_does_not_look_is_an_error(processes: Processes) -> None:
-    """In log and status, by its topic; it is logged and no error any more once the networks are one."""
+    """In log and status, by its topic; once the networks are connected it is logged and no longer an error."""
     domain = processes.environ['ROS_DOMAIN_ID']
     everywhere = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'ROS_LOCALHOST_ONLY': '0'}
     with ExitStack() as stack:
@@ -42,7 +42,7 @@ def test_a_publisher_where_our_profile_does_not_look_is_an_error(processes: Proc
         (line,) = (line for line in node.log.splitlines() if SAID in line)
         assert line.startswith('[ERROR]')
         assert '/there is not fully received: rmw_cyclonedds_cpp finds a publisher that rmw_fastrtps_cpp' in line
-        until(lambda: any(SAID in text for text in findings(node)), 'the status says so')
+        until(lambda: any(SAID in text for text in findings(node)), 'the status reports it')
         assert node.topic('/there').get('received', 0) == 0
         machines.join_networks()
         until(lambda: not any(SAID in text for text in findings(node)), 'it is found')

@@ -1,4 +1,4 @@
-"""Middleware that neither numbers messages nor names their sender, as rclpy of Humble: losses are estimated, or not known."""
+"""Middleware without sequence numbers and senders of messages, as in Humble's rclpy: losses are estimated, or unknown."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from shadowhound_data_logger.core import model
 Taken = model.Taken
 model.Taken = lambda cdr, source_ns, publisher, number, received_ns: Taken(cdr, source_ns, None, None, received_ns)
 """
-"""Before the reader is imported: on Humble that loads the RMW, which is not chosen yet."""
+"""Set before the reader is imported: on Humble that loads the RMW, which is not chosen yet."""
 UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
-"""What nobody takes from its socket buffers is overrun by what follows."""
+"""Messages not taken from its socket buffers are overrun by later ones."""
 COUNT = 100
 PERIOD_S = 0.01
 SIZE = 30_000
 
 
 def started(processes: Processes, folder: Path, sensors: list[str], expected_hz: float = 1 / PERIOD_S) -> Node:
-    """A node that is told no numbers, and a rate: on a busy machine no rhythm is even enough to be learned."""
+    """A node without sequence numbers, and with a rate: on a busy machine no rhythm is even enough to be learned."""
     hidden = folder / 'hidden'
     hidden.mkdir(exist_ok=True)
     (hidden / 'sitecustomize.py').write_text(LEAVE_OUT)
@@ -40,7 +40,7 @@ def started(processes: Processes, folder: Path, sensors: list[str], expected_hz:
 
 @pytest.mark.long('seven seconds of a topic without a rhythm')
 def test_without_a_rhythm_losses_are_unknown(processes: Processes, tmp_path: Path) -> None:
-    """Each message is counted once, also where a history is delivered that two subscriptions hear; what was missed is null."""
+    """Each message is counted once, also when two subscriptions receive a history; missed is null."""
     node, publisher = started(processes, tmp_path, ['plain', 'latched'], 0.0), processes.publisher()
     publisher.create('/plain', STRING)
     publisher.create('/latched', STRING, latched=True)
@@ -56,7 +56,7 @@ def test_without_a_rhythm_losses_are_unknown(processes: Processes, tmp_path: Pat
 
 @pytest.mark.long('a kill')
 def test_losses_are_estimated_from_the_rhythm(processes: Processes, tmp_path: Path) -> None:
-    """By the rate of a publisher that goes on while the node is stopped, and while it is dead: to 5 %, and marked as such."""
+    """By the rate of a publisher that continues while the node is stopped, and after it is killed: within 5 %, and marked."""
     for name in ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE'):
         processes.environ.pop(name, None)
     processes.environ |= UDP
@@ -88,7 +88,7 @@ def test_losses_are_estimated_from_the_rhythm(processes: Processes, tmp_path: Pa
 
 @pytest.mark.long('nine seconds of a topic')
 def test_messages_that_a_dead_publisher_did_not_publish_are_not_lost(processes: Processes, tmp_path: Path) -> None:
-    """One that is killed, and another one in its place two seconds later: the gap between them is nobody's loss."""
+    """A killed publisher, and another one in its place two seconds later: the gap between them is not a loss."""
     node = started(processes, tmp_path, ['calm'])
     for _ in range(2):
         publisher = processes.publisher()

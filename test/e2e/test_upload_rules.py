@@ -25,24 +25,24 @@ PARAMETERS = {
 
 def delivery(node: Node) -> dict[str, Any]:
     path = file(node.home / 'spool', node.robot)
-    until(path.exists, 'the node tells its status')
+    until(path.exists, 'the node has written its status')
     found: dict[str, Any] = json.loads(path.read_text())['store']
     return found
 
 
 @pytest.mark.long('ten seconds of waiting for a dock')
 def test_uploads_wait_for_the_dock(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
-    """A latched message counts however old it is, until its publisher is gone; an event goes at once."""
+    """A latched message counts however old it is, until its publisher is gone; an event is sent immediately."""
     node = processes.node(seaweed.environment(), PARAMETERS)
     unknown = f'{DOCK}:data == true is unknown: no message of {DOCK} was received yet'
-    until(lambda: delivery(node)['waits_for'] == {'upload.when': unknown}, 'it is said what uploads wait for')
+    until(lambda: delivery(node)['waits_for'] == {'upload.when': unknown}, 'the status has what uploads wait for')
     publisher, dock = processes.publisher(), processes.publisher()
     dock.create(DOCK, 'std_msgs/msg/Bool', latched=True, depth=1)
     dock.publish(DOCK, [serialize_message(Bool(data=False))])
     publisher.create(TALK, STRING)
     publisher.matched(TALK)
     publisher.publish(TALK, texts(range(20)))
-    until(lambda: delivery(node)['waits_for'].get('upload.when') == f'{DOCK}:data == true: it is 0', 'the dock is heard')
+    until(lambda: delivery(node)['waits_for'].get('upload.when') == f'{DOCK}:data == true: it is 0', 'it is received')
     until(lambda: node.ledger()['objects']['pending'] == 20, 'all is spooled and none of it is sent')
     done, text = station.event()
     assert done, text

@@ -1,4 +1,4 @@
-"""Uploads yield to viewers on other machines, and no longer than that: a real node, and the page in a separate network."""
+"""Uploads yield to viewers on other machines, and no longer than necessary: a real node, and the page in a separate network."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from shadowhound_data_logger.spool.status import read
 pytestmark = [pytest.mark.ros, pytest.mark.long('a node and two machines')]
 
 NOBODY = {'AWS_ENDPOINT_URL': 'http://127.0.0.1:9', 'AWS_ACCESS_KEY_ID': 'any', 'AWS_SECRET_ACCESS_KEY': 'any'}
-"""A store that is away: what uploads may send is known all the same."""
+"""An unreachable store: the limit of uploads is known anyway."""
 OWN_MBPS, SHARED_MBPS = 20.0, 3.0
 LEASE_S = 5.0
 STATUS_S = 1.0
-"""Between two statuses of the node."""
+"""The interval between two statuses of the node."""
 BUSY_S = 2.0
 """A busy machine may be late."""
 EXEC = 'import os, sys; os.execvp(sys.argv[1], sys.argv[1:])'
-"""So the page has the number of the process that was started, whatever it was started by."""
+"""Makes the page keep the id of the started process, however it was started."""
 
 
 def cap(node: Node) -> float | None:
-    """What the node says that uploads are limited to; None before its first status."""
+    """The current limit of uploads, according to the node; None before its first status."""
     report = read(node.home / 'spool', node.robot, SystemClock.of_this_machine())
     return report.node.store.max_mbps if report.running else None
 
 
 def watching(stack: ExitStack, machine: int, url: str, token: str) -> Iterator[float]:
-    """A viewer there; the cap, each second in which it watches."""
+    """Start a viewer there; the cap, once for each second of its viewing."""
     path = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get('PYTHONPATH')])])
     viewer = subprocess.Popen([*inside(machine), sys.executable, str(HERE / 'watcher.py'), url, token], stdout=subprocess.PIPE,
                               text=True, env={**os.environ, 'PYTHONPATH': path})  # fmt: skip
@@ -51,7 +51,7 @@ def watching(stack: ExitStack, machine: int, url: str, token: str) -> Iterator[f
 
 
 def test_uploads_yield_to_viewers_on_other_machines(tmp_path: Path, domain: int) -> None:
-    """Not to a viewer of the robot itself; as long as the other watches; and after the page was killed for 5 s at most."""
+    """Not to a viewer on the robot itself; while the other one is watching; and at most 5 s after the page was killed."""
     pytest.importorskip('rclpy')
     with ExitStack() as stack:
         machines = Machines(stack)

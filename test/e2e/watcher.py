@@ -11,7 +11,7 @@ from e2e.live_frames import Frames
 
 async def main(url: str, token: str) -> None:
     """Until it is killed."""
-    headers, jar = {'Origin': url.rstrip('/')}, aiohttp.CookieJar(unsafe=True)  # an address is as good as a name
+    headers, jar = {'Origin': url.rstrip('/')}, aiohttp.CookieJar(unsafe=True)  # an address works as well as a name
     async with aiohttp.ClientSession(headers=headers, cookie_jar=jar, raise_for_status=True) as session:
         await session.post(f'{url}api/session', json={'token': token})
         async with session.ws_connect(f'{url}ws') as ws:

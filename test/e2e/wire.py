@@ -1,4 +1,4 @@
-"""A wire to a server that can be cut, hung or answered wrongly while a node uses it."""
+"""A wire to a server that can be cut, hung or made to return errors while a node uses it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Wire:
     """A TCP proxy on 127.0.0.1; ``set`` takes PASS, REFUSE, HANG or an S3 error as ``(status, code)``. It owns one thread."""
 
     def __init__(self, url: str, heard: Callable[[bytes], None] = lambda _: None) -> None:
-        """``heard`` gets what passes to the server, as it comes."""
+        """``heard`` gets the data sent to the server, unchanged."""
         self._heard = heard
         self._target = (urlsplit(url).hostname, urlsplit(url).port)
         self._mode: str | tuple[int, str] = PASS
@@ -39,7 +39,7 @@ class Wire:
         return f'http://127.0.0.1:{self._port}'
 
     def set(self, mode: str | tuple[int, str]) -> None:
-        """Ends all connections and treats new ones so."""
+        """End all connections and handle new ones in the new mode."""
         asyncio.run_coroutine_threadsafe(self._set(mode), self._loop).result(60)
 
     def __enter__(self) -> Self:
@@ -58,7 +58,7 @@ class Wire:
         if self._server is not None:
             for listening in self._server.sockets:
                 self._loop.remove_reader(listening.fileno())
-            # The server learns of an accepted connection a turn later; Python 3.12 never closes one that comes after close().
+            # The server learns of an accepted connection one iteration later; Python 3.12 never closes one after close().
             await asyncio.sleep(0)
             self._server.close()
             self._server = None
@@ -69,11 +69,11 @@ class Wire:
             self._server = await asyncio.start_server(self._accept, '127.0.0.1', self._port, reuse_address=True)
 
     async def _end(self) -> None:
-        """A connection that was accepted in this instant has a task that has not begun: it finds out here."""
+        """A connection accepted just now has a task that has not started: it is closed here."""
         await self._set(REFUSE)
         while others := asyncio.all_tasks() - {asyncio.current_task()}:
             await asyncio.wait(others)
-        await asyncio.sleep(0)  # transports close a turn after they are told to
+        await asyncio.sleep(0)  # transports close one loop iteration later
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -111,7 +111,7 @@ class Wire:
 
     @staticmethod
     async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, status: int, code: str) -> None:
-        """The S3 error, whatever is asked."""
+        """The S3 error, for any request."""
         while True:
             head = (await reader.readuntil(b'\r\n\r\n')).decode('latin-1').lower()
             lines = dict(line.split(': ', 1) for line in head.splitlines()[1:] if ': ' in line)

@@ -1,7 +1,7 @@
-"""Program of a test: hears topics beside the node and writes every message, as it came, to a file.
+"""Program of a test: subscribes to topics next to the node and writes every message, unchanged, to a file.
 
-``python witness.py FILE '{"/imu": ["go2_interfaces/msg/IMU", true]}'``; true is RELIABLE. SIGTERM ends it. It owes nothing
-to the package under test. Each record is a line of JSON (topic, source_ns, bytes) and then so many bytes.
+``python witness.py FILE '{"/imu": ["go2_interfaces/msg/IMU", true]}'``; true is RELIABLE. SIGTERM stops it. It does not use
+the package under test. Each record is a line of JSON (topic, source_ns, bytes) followed by that many bytes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Heard(NamedTuple):
 
 
 def recorded(path: Path) -> Iterator[Heard]:
-    """What a witness wrote."""
+    """The messages that a witness wrote."""
     with path.open('rb') as file:
         while line := file.readline():
             topic, source_ns, size = json.loads(line)

@@ -1,6 +1,6 @@
-"""Gives the node another wall clock: copied as sitecustomize.py to where a Python finds it at its start.
+"""Gives the node a different wall clock: copied as sitecustomize.py to a folder on Python's path.
 
-While there is a file WRONG_CLOCK the clock is as many nanoseconds behind as it says, and so are the times at which messages
+While a file WRONG_CLOCK exists the clock is behind by the number of nanoseconds in it, and so are the times at which messages
 were sent, by a driver on the same machine, and received.
 """
 

@@ -1,4 +1,4 @@
-"""Many bad days, each with its own seed: in virtual time, or over real sockets to a real server."""
+"""Many bad days, each with a seed: in virtual time, or over real sockets to a real server."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def simulated(seeds: Iterable[int], tell: Tell = lambda _: None) -> Summary:
 
 
 def live(seeds: Iterable[int], tower: Tower, tell: Tell = lambda _: None) -> Summary:
-    """Days over real sockets, the server's bucket shared."""
+    """Days over real sockets, with a shared bucket on the server."""
     settings = tower.store_settings()
     direct = S3Store(settings, UploadSettings())
     direct.open()
@@ -39,7 +39,7 @@ def live(seeds: Iterable[int], tower: Tower, tell: Tell = lambda _: None) -> Sum
 
 
 def _days(seeds: Iterable[int], run: Callable[[int, Path], Report], tell: Tell) -> Summary:
-    """Run them all, whatever becomes of one."""
+    """Run all of them, even if one fails."""
     summary = Summary()
     with _quiet():
         for seed in seeds:
@@ -55,7 +55,7 @@ def _days(seeds: Iterable[int], run: Callable[[int, Path], Report], tell: Tell) 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Outages are what is wanted here; nobody has to be told of each."""
+    """Outages are intended here and need not be logged."""
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:

@@ -1,7 +1,7 @@
-"""A front before a real S3 server that does to each request what a script says: the faults of a bad day, over real sockets.
+"""A proxy for a real S3 server that applies a script's fault to each request: the faults of a bad day, over real sockets.
 
-It reads whole requests and sends them on, so it knows what the server took, also where the client never learns it. What is
-on its way goes on when its client has given up, as in a network that is slow.
+It reads complete requests and forwards them, so it knows what the server accepted, also if the client never learns it.
+Forwarding continues after the client has given up, as in a slow network.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _CANNED: Final = {
 
 
 class Front:
-    """New; enter once, leave once. ``script`` says what becomes of each request; it may be replaced at any time.
+    """New; enter once, exit once. ``script`` returns the fault of each request; it may be replaced at any time.
 
-    One thread accepts, each connection has one of its own; ``_lock`` guards what they count.
+    One thread accepts, each connection has another one; ``_lock`` guards the shared counts.
     """
 
     def __init__(self, url: str, script: Callable[[], Fault] = lambda: Fault.NONE, *, secret: str = '',
@@ -54,20 +54,20 @@ class Front:
         self.secret = secret
         self.condition = condition
         self.cut: Callable[[bytes], int] = lambda answer: rng.randrange(STATUS_LINE, len(answer))
-        """Where an answer breaks off: anywhere behind its status."""
+        """Where a response is truncated: anywhere after its status."""
         self.server = str(parts.hostname), parts.port or 80
         self.over = threading.Event()
         self.denied: Counter[str] = Counter()
-        """Path -> how often a request for it was denied."""
+        """Path -> number of denied requests for it."""
         self.stored: dict[str, list[str]] = {}
-        """Path -> SHA-256 of each content that the server took for it, in order."""
+        """Path -> SHA-256 of each content that the server accepted for it, in order."""
         self._refuse_s = refuse_s
         self._refused_until = 0.0
         self._lock = threading.Lock()
         self._on_their_way = 0
         self._connections: set[socket.socket] = set()
         self._threads: list[threading.Thread] = []
-        self._port = socket.socket()  # bound, so that nobody else takes it while nobody listens
+        self._port = socket.socket()  # bound, so that no other process takes it while it does not listen
         self._port.bind((HOST, 0))
         self._port.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.url = f'http://{HOST}:{self._port.getsockname()[1]}'
@@ -87,11 +87,11 @@ class Front:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether nothing is on its way to the server."""
+        """Whether no request is being forwarded."""
         return not self._on_their_way
 
     def refuse(self) -> None:
-        """For a while there is no connection."""
+        """Refuse connections for a while."""
         self._refused_until = time.monotonic() + self._refuse_s
 
     @property
@@ -103,7 +103,7 @@ class Front:
             self.denied[unquote(urlsplit(target).path)] += 1
 
     def forward(self, request: Request, *, slowly: bool = False) -> bytes:
-        """Ask the server; returns its whole answer. Raises OSError or HTTPException when it gives none."""
+        """Send it to the server; returns its complete response. Raises OSError or HTTPException without one."""
         if self.condition is Condition.OVERWRITES:
             request = request.without_condition(self.secret)
         with self._lock:
@@ -120,7 +120,7 @@ class Front:
         return answer
 
     def pieces(self, data: bytes, *, slowly: bool) -> Iterator[bytes]:
-        """All of it, at 1 KB/s if so."""
+        """The complete data, at 1 KB/s if set."""
         step = round(SLOW_BYTES_PER_S * SLICE_S) if slowly else max(len(data), 1)
         for start in range(0, len(data), step):
             if slowly:
@@ -165,7 +165,7 @@ class Front:
 
 
 class _Exchange(BaseHTTPRequestHandler):
-    """One connection: requests until it breaks."""
+    """One connection: requests until it fails."""
 
     protocol_version = 'HTTP/1.1'
     timeout = 60.0
@@ -201,7 +201,7 @@ class _Exchange(BaseHTTPRequestHandler):
     do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = _treat  # noqa: N815 - as BaseHTTPRequestHandler calls them
 
     def _can(self, fault: Fault, request: Request) -> None:
-        """An answer that needs no server; of a server that does not know the condition, where it is asked for one."""
+        """A response that needs no server; of a server without the condition, if the request has one."""
         if fault in {Fault.NONE, Fault.NO_CONDITION} and 'if-none-match' not in request.headers:
             self._pass_on(Fault.NONE, request)
             return
@@ -239,22 +239,22 @@ class _Exchange(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def _hang(self) -> None:
-        """Until the client gives up."""
+        """Wait until the client gives up."""
         self.close_connection = True
         while not self.server.over.is_set() and not select.select([self.connection], [], [], POLL_S)[0]:
             pass
 
     def _abort(self) -> None:
-        """The client gets a reset."""
+        """Reset the client's connection."""
         self.close_connection = True
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _ABORT)
 
     def log_message(self, *_: object) -> None:
-        """Quiet."""
+        """Log nothing."""
 
 
 def _dated(answer: bytes) -> bytes:
-    """The answer with the server's own idea of the time."""
+    """The response with the server's time."""
     head, _, body = answer.partition(b'\r\n\r\n')
     lines = [line for line in head.split(b'\r\n') if not line.lower().startswith(b'date:')]
     ahead = formatdate(time.time() + OFF.total_seconds(), usegmt=True)

@@ -1,4 +1,4 @@
-"""What can go wrong between a logger and its store, and bad days made of it by a seed."""
+"""Possible faults between a logger and its store, and bad days generated from a seed."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ LONG: Final = 'SHADOWHOUND_TEST_LONG'
 
 
 class Fault(str, Enum):
-    """What becomes of one request."""
+    """The fault of one request."""
 
     NONE = 'none'
     REFUSED = 'refused'
-    """The connection is refused, and so is everything for a while."""
+    """The connection is refused, and so are all others for a while."""
     RESET = 'reset'
     """The connection is reset in the middle of the request's body."""
     HUNG = 'hung'
-    """The connection is accepted, and nothing is ever answered."""
+    """The connection is accepted, without any response."""
     SLOW = 'slow'
     """1 KB/s: the object may reach the server long after the client gave up."""
     ERROR_500 = '500'
@@ -33,34 +33,34 @@ class Fault(str, Enum):
     SKEWED = 'skewed'
     """The clocks differ by twenty minutes."""
     PORTAL = 'portal'
-    """A login page answers 200 in the server's place."""
+    """A login page responds with 200 in place of the server."""
     CUT = 'cut'
-    """The server did what it was asked; its answer breaks off."""
+    """The server handled the request; its response is truncated."""
     ACK_LOST = 'ack lost'
-    """The server did what it was asked; there is no answer."""
+    """The server handled the request; there is no response."""
     NO_CONDITION = '501'
-    """The server does not know If-None-Match."""
+    """The server does not support If-None-Match."""
 
 
 class Condition(str, Enum):
-    """What the server does with If-None-Match for as long as it stands."""
+    """How the server handles If-None-Match while this is set."""
 
     HONOURED = 'honoured'
     NOT_IMPLEMENTED = 'not implemented'
     OVERWRITES = 'overwrites'
-    """It ignores the condition and takes everything."""
+    """It ignores the condition and accepts everything."""
 
 
 FAULTS: Final = tuple(fault for fault in Fault if fault is not Fault.NONE)
 STORING: Final = frozenset({Fault.NONE, Fault.SLOW, Fault.CUT, Fault.ACK_LOST})
-"""The object may be in the store all the same."""
+"""The object may be in the store anyway."""
 LONGEST_RUN: Final = 8
 
 
 class Script:
-    """The faults of a run of requests, in the order in which they arrive; then none. Thread-safe.
+    """The faults of a sequence of requests, in order of arrival; then none. Thread-safe.
 
-    Runs of one fault alternate with calm and with rough weather, in which each request may meet another fault.
+    Runs of one fault alternate with calm and with rough periods, in which each request may have a different fault.
     """
 
     def __init__(self, faults: Sequence[Fault] = ()) -> None:
@@ -71,11 +71,11 @@ class Script:
 
     @classmethod
     def of(cls, rng: random.Random, runs: int, kinds: Sequence[Fault] = FAULTS) -> Script:
-        """A random one of so many runs."""
+        """A random one with this many runs."""
         return cls([fault for _ in range(runs) for fault in _run(rng, kinds)])
 
     def __call__(self) -> Fault:
-        """What becomes of the next request."""
+        """The fault of the next request."""
         with self._lock:
             fault = next(self._faults, None)
             self._over = fault is None
@@ -84,7 +84,7 @@ class Script:
             return found
 
     def end(self) -> None:
-        """No fault any more."""
+        """End all faults."""
         with self._lock:
             self._faults = iter(())
             self._over = True
@@ -105,7 +105,7 @@ def _run(rng: random.Random, kinds: Sequence[Fault]) -> Iterator[Fault]:
 
 
 def given_seed() -> int:
-    """The seed that was asked for, else a new one."""
+    """The requested seed, otherwise a new one."""
     return int(os.environ.get(SEED) or secrets.randbelow(1_000_000_000))
 
 

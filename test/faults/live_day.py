@@ -1,7 +1,7 @@
-"""One bad day of delivery over real sockets: a real spool, its writer, the uploader and the S3 store, a front, a real server.
+"""One bad day of delivery over real sockets: a real spool, its writer, the uploader and the S3 store, a proxy, a real server.
 
-The seed makes the objects, the kills and the faults in the order in which requests arrive; which thread's request arrives
-first is the machine's affair, so a seed repeats the weather, not each step. What must not happen is raised as AssertionError.
+The seed determines the objects, the kills and the faults by order of arrival; which thread's request arrives first depends on
+the machine, so a seed repeats the conditions, not each step. Forbidden outcomes are raised as AssertionError.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SIZES: Final = (0, 100, 700, 2000)
 
 
 class Process:
-    """One life of the stages behind the encoders, wired as in the node."""
+    """One process with the stages behind the encoders, connected as in the node."""
 
     def __init__(self, root: Path, settings: StoreSettings, seed: int) -> None:
         self.spool = Spool(root, SpoolSettings(min_free_bytes=0), SystemClock('a-boot'), 'thor')
@@ -58,7 +58,7 @@ class Process:
             self.writer.put(item)
 
     def close(self) -> None:
-        """Stop, whatever is on its way; idempotent."""
+        """Stop, whatever is in progress; idempotent."""
         self.uploader.close(0.05)
         assert self.writer.close(60)
         self.store.close()
@@ -67,7 +67,7 @@ class Process:
 
 
 class Day:
-    """New; run once. ``settings`` are the server's own, ``direct`` a store without the front; keys begin with a folder's name."""
+    """New; run once. ``settings`` are the server's, ``direct`` a store without the proxy; keys start with a folder's name."""
 
     def __init__(self, seed: int, folder: Path, settings: StoreSettings, direct: S3Store) -> None:
         self._rng = random.Random(seed)
@@ -126,7 +126,7 @@ class Day:
         )  # fmt: skip
 
     def _take_keys(self) -> None:
-        """Somebody else was there before."""
+        """Put foreign objects under some keys."""
         self._theirs = set(self._rng.sample(sorted(self._bodies), self._rng.randint(0, 2)))
         made = Spooled(self._root.parent, BUCKET)
         for key in self._theirs:
@@ -134,7 +134,7 @@ class Day:
         self._report.objects, self._report.foreign = len(self._bodies), len(self._theirs)
 
     def _put_back(self) -> int:
-        """What somebody has to do about objects that were denied twice while others were taken."""
+        """Do what an operator must do about objects that were denied twice while others were accepted."""
         denied = [row['key'] for row in rows(self._root) if row['reason'] == 'access_denied']
         for key in denied:
             assert self._front.denied[f'/{BUCKET}/{key}'] > 1
@@ -152,10 +152,10 @@ class Day:
             assert time.monotonic() < end, f'not within {DEADLINE_S:g} s'
             time.sleep(0.01)
 
-    # -- what must hold afterwards -----------------------------------------------------------------------------------
+    # -- invariants at the end -------------------------------------------------------------------------------------
 
     def _check(self) -> None:
-        """Everything is there once, under its key, with its content; what was there before is untouched; the ledger closes."""
+        """Everything is there once, under its key, with its content; foreign objects are unchanged; the ledger balances."""
         held = {info.key: self._direct.get(BUCKET, info.key) for info in self._direct.list(BUCKET, f'{self._name}/')}
         wanted = self._bodies | dict.fromkeys(self._theirs, FOREIGN)
         differing = sorted(key for key in held | wanted if held.get(key) != wanted.get(key))

@@ -1,4 +1,4 @@
-"""What bad days were made of and how they ended, for one day and for many."""
+"""The contents of bad days and their outcomes, for one day and for many."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ class Report:
     condition: Condition
     objects: int = 0
     foreign: int = 0
-    """Objects whose key somebody else had taken."""
+    """Objects with a key that a foreign object already had."""
     kills: int = 0
-    """Ends of the process in the middle of it."""
+    """Kills of the process during the day."""
     requests: int = 0
     repeated: int = 0
-    """Puts that wrote the same content once more, on a server that does not know or honor If-None-Match."""
+    """Puts that wrote the same content again, on a server that does not support or honor If-None-Match."""
     put_back: int = 0
-    """Objects that were denied twice while others were taken, and that somebody moved back from quarantine."""
+    """Objects that were denied twice while others were accepted, and that the operator moved back from quarantine."""
     lasted_s: float = 0.0
     faults: Counter[Fault] = field(default_factory=Counter)
 
 
 @dataclass(slots=True)
 class Summary:
-    """Many days: totals, and what went wrong by seed."""
+    """Many days: totals, and failures by seed."""
 
     days: int = 0
     totals: Counter[str] = field(default_factory=Counter)
@@ -50,7 +50,7 @@ class Summary:
         self.lasted_s += report.lasted_s
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """As data for JSON."""
         return {
             'days': self.days, **self.totals, 'lasted_s': round(self.lasted_s, 1), 'servers': dict(self.conditions),
             'faults': {fault.value: self.faults[fault.value] for fault in Fault if fault is not Fault.NONE},
@@ -58,7 +58,7 @@ class Summary:
         }  # fmt: skip
 
     def lines(self) -> Iterable[str]:
-        """For people."""
+        """As text."""
         totals = self.totals
         yield (f'{self.days} days, {totals["objects"]} objects, {totals["requests"]} requests, {self.faults.total()} of them '
                f'with a fault, {totals["kills"]} kills in between, {self.lasted_s:.0f} s')  # fmt: skip

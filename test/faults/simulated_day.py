@@ -1,7 +1,7 @@
 """One bad day of delivery in virtual time, by a seed: the real Uploader, Schedule, S3Store and Spool over a simulated wire.
 
-Nothing waits: only the clock, the pauses and the network are not real. A day that is run twice is the same to the last
-request, so a seed is a bug report. What a logger could not survive is raised as AssertionError.
+Nothing really waits: only the clock, the pauses and the network are simulated. A repeated day is identical down to the last
+request, so a seed is a bug report. Forbidden outcomes are raised as AssertionError.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ COMMIT_S: Final = 0.25
 DAY_S: Final = 86_400.0
 PRODUCING_S: Final = 120.0
 CALM_S: Final = 900.0
-"""Within so long after the last fault everything is delivered: a backoff of a minute, and a second one."""
+"""The time after the last fault within which everything is delivered: a backoff of a minute, and a second one."""
 MAX_THREADS: Final = 4
 FOREIGN: Final = b'of another writer'
 
 
 def _ever(step: Callable[[], None]) -> Callable[[], None]:
-    """As a Worker does that nobody stops; a defect ends the day."""
+    """Run as a Worker that is never stopped; a defect ends the day."""
 
     def work() -> None:
         while True:
@@ -51,7 +51,7 @@ def _ever(step: Callable[[], None]) -> Callable[[], None]:
 
 
 class Process:
-    """One life of a logger on a spool, from its start to a kill or a stop."""
+    """One process of a logger on a spool, from its start to a kill or a stop."""
 
     def __init__(self, time: VirtualTime, root: Path, line: Line, rng: random.Random) -> None:
         self.spool = Spool(root, SpoolSettings(min_free_bytes=0), time, 'thor')
@@ -80,14 +80,14 @@ class Process:
             self.uploader.wake(put(self.spool, *items))
 
     def kill(self) -> None:
-        """As ``kill -9``: what is on its way stays so, what is in memory is gone, nothing is closed in order."""
+        """Like ``kill -9``: requests in flight continue, memory is lost, nothing is closed properly."""
         self._end()
         parts: Any = self.spool
         parts._connections.writing.close()
         os.close(parts._session._lock)
 
     def stop(self) -> None:
-        """In order, with everything durable."""
+        """Stop properly, with everything durable."""
         self._commit()
         self._schedule.stop()
         self._end()
@@ -100,7 +100,7 @@ class Process:
         assert self.uploader.status().worker_failures == 0, self.uploader.status().last_error
 
     def _settle(self, outcomes: Sequence[Outcome]) -> None:
-        """As the SpoolWriter: durable a little later. Nothing may be called delivered that is not there, nor be sent again."""
+        """As the SpoolWriter: durable a little later. No object may be delivered without being stored, or sent again."""
         for outcome in outcomes:
             assert outcome.item.id not in self._settled, f'{outcome.item.key} is settled twice'
             self._settled.add(outcome.item.id)
@@ -129,7 +129,7 @@ class Day:
         self._server = Server(self._rng.choice((Condition.HONOURED, *Condition)))
         self._server.buckets = set(BUCKETS[: self._rng.randint(0, 2)])
         if self._server.condition is Condition.OVERWRITES:
-            kinds = [kind for kind in kinds if kind is not Fault.DENIED]  # without a look it could not be found out
+            kinds = [kind for kind in kinds if kind is not Fault.DENIED]  # without a check it could not be detected
         self._script = Script.of(self._rng, self._rng.randint(1, 12), kinds)
         self._line = Line(self._time, self._server, self._script, self._rng)
         self._bodies: dict[tuple[str, str], bytes] = {}
@@ -154,7 +154,7 @@ class Day:
     # -- what happens ----------------------------------------------------------------------------------------------------
 
     def _plan(self) -> None:
-        """Objects in groups over some minutes, keys that others have taken, and up to two kills."""
+        """Objects in groups over some minutes, foreign keys, and up to two kills."""
         number = 0
         groups, kills = self._rng.randint(2, 8), self._rng.randint(0, 2)
         self._to_come = groups + kills
@@ -194,7 +194,7 @@ class Day:
         self._to_come -= 1
 
     def _drain(self) -> None:
-        """Until nothing is to come and nothing waits, and what may still arrive has arrived; soon after the last fault."""
+        """Run until no more objects come and none is pending or in flight; soon after the last fault."""
         self._time.run(lambda: not self._to_come and (self._script.is_over or self._is_drained()), DAY_S)
         assert self._time.run(self._is_drained, CALM_S), f'{self._process.spool.pending_count()} objects are not delivered'
         self._process.stop()
@@ -204,7 +204,7 @@ class Day:
         return self._process.spool.pending_count() == 0
 
     def _put_back(self) -> None:
-        """What somebody has to do about objects that were denied twice while others were taken."""
+        """Do what an operator must do about objects that were denied twice while others were accepted."""
         denied = [row for row in rows(self._root) if row['reason'] == 'access_denied']
         if not denied:
             return
@@ -219,10 +219,10 @@ class Day:
         self._process = self._begin()
         self._drain()
 
-    # -- what must hold afterwards -----------------------------------------------------------------------------------
+    # -- invariants at the end -------------------------------------------------------------------------------------------
 
     def _check(self) -> None:
-        """Everything is there once, under its key, with its content; what was there before is untouched; the ledger closes."""
+        """Everything is there once, under its key, with its content; foreign objects are unchanged; the ledger balances."""
         assert not self._server.overwritten
         held = {where: body for where, (body, _) in self._server.objects.items()}
         assert held == self._bodies | dict.fromkeys(self._theirs, FOREIGN)

@@ -1,4 +1,4 @@
-"""An S3 server and the way to it, simulated: what S3Requests does, in virtual time, through the faults of a script."""
+"""A simulated S3 server and the network to it: acts as S3Requests, in virtual time, with the faults of a script."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from shadowhound_data_logger.stores.s3_requests import Sent
 READ_TIMEOUT_S: Final = 30.0
 REFUSE_S: Final = 60.0
 LATEST_S: Final = 600.0
-"""So long after it was sent may an object whose sender gave up appear."""
+"""The time after sending within which an abandoned object may still arrive."""
 SLOW_BYTES_PER_S: Final = 1024.0
 Where = tuple[str, str]
 T = TypeVar('T')
 
 
 class Server:
-    """What is stored, and what was done to it; every change is immediate."""
+    """The stored objects, and the changes; every change is immediate."""
 
     def __init__(self, condition: Condition) -> None:
         self.condition = condition
@@ -37,7 +37,7 @@ class Server:
         self.repeated: Counter[Where] = Counter()
         """Written again with the same content."""
         self.overwritten: list[Where] = []
-        """Written again with other content: what must never happen."""
+        """Written again with different content: this must never happen."""
 
     def put(self, info: ObjectInfo, body: bytes, *, conditional: bool) -> Sent:
         where = info.bucket, info.key
@@ -63,7 +63,7 @@ class Server:
 
 
 class Line:
-    """The network between one process and a server. ``started`` is told of each put that begins."""
+    """The network between one process and a server. ``started`` is called for each put that starts."""
 
     endpoint = 'simulated'
     generation = 0
@@ -128,7 +128,7 @@ class Line:
     # -- the faults --------------------------------------------------------------------------------------------------
 
     def _ask(self, reach: Callable[[Fault], T], where: Where, size: int = 0) -> T:
-        """One request: some time there, what the server does or not, some time back or not."""
+        """One request: latency, the server's handling if any, and latency of the response if any."""
         self.requests += 1
         self._time.sleep(self._rng.uniform(0.001, 0.05))
         if self._time.now < self._refused_until:
@@ -145,20 +145,20 @@ class Line:
                 self._time.sleep(seconds)
                 return reach(fault)
             self._time.after(seconds, lambda: self._land(reach))
-        elif fault is Fault.HUNG and self._rng.random() < 0.5:  # it is on its way still, somewhere
+        elif fault is Fault.HUNG and self._rng.random() < 0.5:  # it is still in flight
             self._time.after(self._rng.uniform(1.0, LATEST_S), lambda: self._land(reach))
         self._fail(fault, where)
         raise AssertionError(f'{fault} is not a failure')
 
     def _land(self, reach: Callable[[Fault], object]) -> None:
-        """It reaches the server, and nobody learns what the server says."""
+        """It reaches the server, and the response is lost."""
         try:
             reach(Fault.NONE)
         except (BucketMissing, ObjectRefused):
             return
 
     def _fail(self, fault: Fault, where: Where) -> None:
-        """What the client sees, when it does."""
+        """What the client receives, and when."""
         if fault is Fault.REFUSED:
             self._refused_until = self._time.now + self._rng.uniform(0.0, REFUSE_S)
         elif fault in {Fault.HUNG, Fault.SLOW} or (fault is Fault.ACK_LOST and self._rng.random() < 0.5):

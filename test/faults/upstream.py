@@ -16,7 +16,7 @@ _AUTHORIZATION: Final = re.compile(r'AWS4-HMAC-SHA256 Credential=([^,]+), ?Signe
 
 
 def signed_again(method: str, target: str, headers: Mapping[str, str], secret: str) -> dict[str, str]:
-    """The headers (names in lower case) with a signature that fits them as they are now; same key, scope and payload hash."""
+    """The headers (names in lower case) with a valid signature; same key, scope and payload hash."""
     found = _AUTHORIZATION.fullmatch(headers['authorization'])
     assert found, headers['authorization']
     credential, names, _ = found.groups()
@@ -39,12 +39,12 @@ def signed_again(method: str, target: str, headers: Mapping[str, str], secret: s
 TIMEOUT_S: Final = 30.0
 OFF: Final = timedelta(minutes=20)
 HOP: Final = frozenset({'connection', 'expect', 'keep-alive', 'transfer-encoding'})
-"""Headers that concern two neighbors only; none of them is signed."""
+"""Hop-by-hop headers; none of them is signed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request as it came; the names of its headers are in lower case."""
+    """One received request; the names of its headers are in lower case."""
 
     method: str
     target: str
@@ -52,14 +52,14 @@ class Request:
     body: bytes
 
     def without_condition(self, secret: str) -> Request:
-        """As if the server did not know the header."""
+        """As if the server did not support the header."""
         if 'if-none-match' not in self.headers:
             return self
         kept = {name: value for name, value in self.headers.items() if name != 'if-none-match'}
         return replace(self, headers=signed_again(self.method, self.target, kept, secret))
 
     def of_another_time(self, secret: str) -> Request:
-        """As a machine sends it whose clock is twenty minutes late; what nobody signed is as it was."""
+        """As from a machine with a clock that is twenty minutes behind; unsigned requests are unchanged."""
         if 'authorization' not in self.headers:
             return self
         late = f'{datetime.now(timezone.utc) - OFF:%Y%m%dT%H%M%SZ}'
@@ -67,7 +67,7 @@ class Request:
 
 
 def ask(server: tuple[str, int], request: Request, pieces: Iterable[bytes]) -> tuple[int, bytes]:
-    """Send it, its body in these pieces; returns the status, and the whole answer as it goes over a wire."""
+    """Send it with these pieces as its body; returns the status, and the complete response as bytes."""
     connection = http.client.HTTPConnection(*server, timeout=TIMEOUT_S)
     try:
         connection.putrequest(request.method, request.target, skip_host=True, skip_accept_encoding=True)

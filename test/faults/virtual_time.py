@@ -1,4 +1,4 @@
-"""Threads that run one at a time in the order of a clock that stands still while they run: the same seed, the same run."""
+"""Threads that run one at a time in the order of a clock that is stopped while they run: the same seed, the same run."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.shipping.schedule import Rest, Schedule
 
 STUCK_S: Final = 30.0
-"""Real seconds without a word from the one thread that may run: it waits for something that is not of this time."""
+"""Real seconds without progress of the only running thread: it waits for something outside the virtual time."""
 
 
 class Killed(BaseException):
-    """Ends a thread of a process that was killed, wherever it is."""
+    """Stops a thread of a killed process, wherever it is."""
 
 
 class Actor:
@@ -28,14 +28,14 @@ class Actor:
         self.error: BaseException | None = None
         self._time = time
         self._target = target
-        self._go = threading.Lock()  # both are held but for the moment in which the other side is let go
+        self._go = threading.Lock()  # both are held except while the other side runs
         self._paused = threading.Lock()
         self._go.acquire()
         self._paused.acquire()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def resume(self) -> None:
-        """Let it run until it sleeps or ends; called by the one who owns the clock."""
+        """Let it run until it sleeps or ends; called by the owner of the clock."""
         if self._thread.ident is None:
             self._thread.start()
         self._go.release()
@@ -47,7 +47,7 @@ class Actor:
             raise self.error
 
     def pause(self) -> None:
-        """Called by its own thread: let the others run."""
+        """Let the others run; called by the actor's thread."""
         self._paused.release()
         self._go.acquire()
         if self.killed:
@@ -68,7 +68,7 @@ class Actor:
 
 
 class VirtualTime:
-    """A monotonic clock (call it), a wall clock, and what is to happen when. One thread owns it and calls ``run``."""
+    """A monotonic clock (call it), a wall clock, and scheduled events. One thread owns it and calls ``run``."""
 
     boot_id = 'a-boot'
 
@@ -92,7 +92,7 @@ class VirtualTime:
         return round(self.now * SECOND)
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do it then; what is due at the same time comes in a random order."""
+        """Run it then; events at the same time run in random order."""
         self._count += 1
         heapq.heappush(self._events, (self.now + seconds, self._rng.random(), self._count, action))
 
@@ -103,18 +103,18 @@ class VirtualTime:
         return actor
 
     def kill(self, actor: Actor) -> None:
-        """It does nothing any more."""
+        """Cancel it."""
         actor.killed = True
         if not actor.ended:
             actor.resume()
 
     def end(self) -> None:
-        """Kill what is left."""
+        """Kill all remaining actors."""
         for actor in self._actors:
             self.kill(actor)
 
     def run(self, until: Callable[[], bool], most_s: float) -> bool:
-        """Let time pass until something is so; False when it was not after so many seconds."""
+        """Let time pass until the condition is true; False if it is not after this many seconds."""
         end = self.now + most_s
         while not until():
             if not self._events or self._events[0][0] > end:
@@ -133,7 +133,7 @@ class VirtualTime:
         actor.pause()
 
     def rest_on(self, schedule: Schedule) -> Callable[[Rest], None]:
-        """What ``schedule.rest`` does, in this time."""
+        """As ``schedule.rest``, in virtual time."""
 
         def rest(rest: Rest) -> None:
             if schedule._version != rest.version:
@@ -170,7 +170,7 @@ class VirtualTime:
             self._resume(entry[0])
 
     def _notice_changes(self) -> None:
-        """Those that rest on something that changed go on."""
+        """Resume actors that wait for something that has changed."""
         for entry in [entry for entry in self._resting if entry[1]._version != entry[2].version]:
             self._resting.remove(entry)
             self._wake(entry[0], 0.0)

@@ -44,7 +44,7 @@ class Ros:
         self.sensors = {sensor.name: sensor for sensor in Settings.load({}, {}).sensors}
 
     def make(self, type_name: str, **values: Any) -> Any:
-        """A message of zeros and empty sequences, but for the given values (a dict makes the nested message)."""
+        """A message of zeros and empty sequences, except for the given values (a dict makes the nested message)."""
         made = {}
         for name, description in self.store.fielddefs[type_name][1]:
             value = values.pop(name, None)
@@ -73,7 +73,7 @@ class Ros:
         return bytes(self.store.serialize_cdr(message, type_name, little_endian=little_endian))
 
     def encode(self, type_name: str, *cdrs: bytes, sensor: str = '', stamps: Sequence[int] = (), **changes: Any) -> Encoding:
-        """What the encoder makes of these messages with the default settings of the type's sensor, and these changes."""
+        """The encoder's result for these messages with the default settings of the type's sensor, and these changes."""
         name = sensor or TOPICS[type_name]
         settings = self.sensors[name]
         settings = type(settings)(**{field: getattr(settings, field) for field in settings.__slots__} | changes)
@@ -84,7 +84,7 @@ class Ros:
 
 @pytest.fixture(scope='session')
 def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An ament prefix that holds go2_interfaces and nothing else."""
+    """An ament prefix with go2_interfaces only."""
     share = tmp_path_factory.mktemp('prefix') / 'share' / 'go2_interfaces'
     share.mkdir(parents=True)
     (share / 'msg').symlink_to(GO2_MESSAGES, target_is_directory=True)

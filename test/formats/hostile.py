@@ -1,7 +1,7 @@
-"""Messages that somebody made to break the encoders; used by test_hostile.py and by ``python -m torture.fuzz``.
+"""Hostile messages for the encoders; used by test_hostile.py and by ``python -m torture.fuzz``.
 
-They begin as valid ones. Words are replaced by lengths that lie, bytes are flipped, ends are cut, another type's bytes stand
-in their place, or all of it is noise.
+They start as valid ones. Words are replaced by false lengths, bytes are flipped, ends are truncated, bytes of another type
+replace them, or everything is noise.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from shadowhound_data_logger.formats.types import MessageTypes, header_frame_id,
 
 LENGTHS: Final = (0, 1, 2, 3, 4, 5, 0x7F, 0xFF, 0x100, 0xFFFF, 0x10000, 0xFF_FFFF, 0x3FFF_FFFF, 0x7FFF_FFFF, 0x8000_0000,
                   0xFFFF_FFFC, 0xFFFF_FFFE, 0xFFFF_FFFF)  # fmt: skip
-"""Lengths, sizes, offsets and enumerations that are chosen badly."""
+"""Badly chosen lengths, sizes, offsets and enumerations."""
 SHARE: Final = 100
 """Bytes that encoding may take for each byte of a message: Python objects of small records are the most wasteful."""
 FLOOR_BYTES: Final = 2 << 20
 SLOWEST_S: Final = 30.0
-"""A second would suffice on an idle machine."""
+"""A second is enough on an idle machine."""
 TYPES: Final = (
     'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/JointState',
     'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Odometry', 'nav_msgs/msg/OccupancyGrid', 'std_msgs/msg/String',
@@ -42,7 +42,7 @@ Damage = Callable[[random.Random, bytearray], bytearray]
 
 
 def _lie(rng: random.Random, cdr: bytearray) -> bytearray:
-    """A 4-byte word, where CDR has them, is another number."""
+    """Replace a 4-byte word, at a CDR position, by another number."""
     for _ in range(rng.choice((1, 1, 2, 4))):
         if len(cdr) >= 8:
             at = 4 + 4 * rng.randrange((len(cdr) - 4) // 4)
@@ -85,13 +85,13 @@ class Fuzzer:
         self._sensors: list[SensorSettings] = list(ros.sensors.values())
         self._valid = {name: content(ros, name) for name in TYPES if name in ros.store.fielddefs}
         self.outcomes: Counter[str] = Counter()
-        for name, format_name in product(self._valid, FORMATS):  # what is loaded when it is first asked for is loaded now
+        for name, format_name in product(self._valid, FORMATS):  # load everything that is loaded on first use
             sensor = replace(self._sensors[0], format=format_name)
             for cdr in self._valid[name]:
                 encode(Batch(sensor.name, '/valid', name, (Sample(0, cdr),), len(cdr)), sensor, 'thor', self._types)
 
     def round(self, seed: int) -> None:
-        """One batch; AssertionError, or whatever an encoder lets through, where it is not treated as it must be."""
+        """One batch; AssertionError, or an encoder's exception, if it is not handled as it must be."""
         rng = random.Random(seed)
         type_name = rng.choice(TYPES)
         samples = tuple(Sample(rng.choice((0, 1, 1_760_788_800 * 10**9, 2**62, -1)), self.message(rng, type_name))
@@ -111,7 +111,7 @@ class Fuzzer:
         self.outcomes['encoded'] += kept
 
     def message(self, rng: random.Random, type_name: str) -> bytes:
-        """Hostile bytes for this type; what the intake itself reads of them must be read without an error, too."""
+        """Hostile bytes for this type; the intake's own reads of them must succeed, too."""
         name = type_name if type_name in self._valid and rng.random() < 0.9 else rng.choice(list(self._valid))
         cdr = bytes(rng.choice(DAMAGES)(rng, bytearray(rng.choice(self._valid[name]))))
         assert isinstance(header_stamp_ns(cdr), int)
@@ -130,7 +130,7 @@ def measured(work: Callable[[], Encoding]) -> tuple[Encoding, int, float]:
 
 
 def content(ros: Any, type_name: str) -> list[bytes]:
-    """Valid messages of a type, in both byte orders, with something in the fields that encoders look into."""
+    """Valid messages of a type, in both byte orders, with content in the fields that encoders read."""
     values: dict[str, Any] = {}
     variants = [values]
     if type_name.endswith('/Image'):

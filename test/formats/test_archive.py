@@ -41,7 +41,7 @@ def members(made: Any) -> dict[str, bytes]:
 
 
 def samples(made: Any) -> dict[str, dict[str, bytes]]:
-    """Key -> kind -> content, put together as WebDataset does: neighbors whose names are the same up to the first dot."""
+    """Key -> kind -> content, assembled as WebDataset does: neighbors with the same name up to the first dot."""
     found: dict[str, dict[str, bytes]] = {}
     last = None
     for name, content in members(made).items():
@@ -68,7 +68,7 @@ def pack(ros: Any, type_name: str, *cdrs: bytes, format_name: str, **changes: An
 
 @ARCHIVES
 def test_an_archive_has_each_frame_and_its_description(ros: Any, format_name: str) -> None:
-    """Each frame is there byte for byte, and its JSON says when, where from and how large it is."""
+    """Each frame is there byte for byte, and its JSON has time, origin and size."""
     frames = [jpeg(shade) for shade in (10, 100, 200)]
     encoding = pack(ros, COMPRESSED, *(frame(ros, data) for data in frames), format_name=format_name)
     assert encoding.rejected == {}
@@ -121,7 +121,7 @@ def test_each_type_has_its_file_in_the_archive(ros: Any, format_name: str) -> No
 
 @ARCHIVES
 def test_files_are_sorted_by_time(ros: Any, format_name: str) -> None:
-    """Samples are sorted by time however they came; of two with one stamp the second is numbered, so that none is lost."""
+    """Samples are sorted by time in any order of arrival; of two with one stamp the second is numbered, so that none is lost."""
     stamps = [STAMP_NS + 5, STAMP_NS, STAMP_NS + 5, STAMP_NS + 3, STAMP_NS + 5]
     cdrs = [frame(ros, jpeg(shade)) for shade in range(5)]
     made = pack(ros, COMPRESSED, *cdrs, format_name=format_name, stamps=stamps).object
@@ -134,7 +134,7 @@ def test_files_are_sorted_by_time(ros: Any, format_name: str) -> None:
 
 @ARCHIVES
 def test_bad_messages_are_rejected_and_the_rest_is_archived(ros: Any, format_name: str) -> None:
-    """What cannot be encoded is counted by reason and is not in the archive; with nothing left there is none."""
+    """Failed messages are counted by reason and are not in the archive; if none is left there is no archive."""
     good = frame(ros, jpeg(1))
     encoding = pack(ros, COMPRESSED, b'', good, frame(ros, b''), good, format_name=format_name)
     assert encoding.rejected == {'malformed': 1, 'empty': 1}
@@ -146,7 +146,7 @@ def test_bad_messages_are_rejected_and_the_rest_is_archived(ros: Any, format_nam
 @ARCHIVES
 @pytest.mark.parametrize('stamp_ns', [-5_000_000_000, 0, STAMP_NS, 2**62])
 def test_the_same_batch_gives_the_same_bytes(ros: Any, format_name: str, stamp_ns: int) -> None:
-    """Nothing but the messages decides an archive; the files' times are their messages', as far as the format can say."""
+    """An archive only depends on its messages; the files' times are their messages', as far as the format allows."""
     cdrs = [frame(ros, jpeg(shade)) for shade in range(2)]
     made, again = (pack(ros, COMPRESSED, *cdrs, format_name=format_name, stamps=[stamp_ns] * 2).object for _ in range(2))
     assert made.body == again.body
@@ -180,7 +180,7 @@ def test_the_files_are_plain_files(ros: Any) -> None:
 
 @ARCHIVES
 def test_equal_frames_are_packed_once(ros: Any, format_name: str) -> None:
-    """With ``dedup`` each message keeps its JSON, which names the file that it repeats; one that comes back later is a file."""
+    """With ``dedup`` each message keeps its JSON, which names the file that it repeats; a later recurrence is a file."""
     same, other = jpeg(10), jpeg(200)
     frames = [same, same, same, other, same]
     made = pack(ros, COMPRESSED, *(frame(ros, data) for data in frames), format_name=format_name, dedup=True).object
@@ -197,7 +197,7 @@ def test_equal_frames_are_packed_once(ros: Any, format_name: str) -> None:
 @pytest.mark.parametrize('stamp_ns', [-1, 0, STAMP_NS, 1 << 62])
 @pytest.mark.parametrize('size', [0, 1, 511, 512, 70_000])
 def test_a_tar_is_as_the_standard_library_makes_it(stamp_ns: int, size: int) -> None:
-    """Byte for byte, whatever time and size a file has."""
+    """Byte for byte, for any time and size of a file."""
     body, name = bytes(size), f'{stamp_ns:019d}.jpg'
     expected = io.BytesIO()
     with tarfile.open(fileobj=expected, mode='w', format=tarfile.USTAR_FORMAT) as packed:

@@ -107,7 +107,7 @@ def as_rclpy(type_name: str, cdr: bytes) -> Any:
 
 
 def normal(value: Any) -> Any:
-    """The same value, whatever each side makes of a byte: rclpy has bytes, ``rosbags`` a signed number."""
+    """The same value in both representations of a byte: rclpy has bytes, ``rosbags`` a signed number."""
     if isinstance(value, dict):
         return {name: unsigned(normal(item)) if 'byte' in name else normal(item) for name, item in value.items()
                 if name != 'structure_needs_at_least_one_member'}  # fmt: skip
@@ -254,6 +254,6 @@ def test_a_header_without_nul_is_read(kind: int) -> None:
 
 
 def test_a_counter_at_another_alignment_is_unknown() -> None:
-    """The place of a counter is that of CDR; of XCDR2 nothing is claimed."""
+    """The position of a counter is that in CDR; in XCDR2 it is unknown."""
     field = CounterField(4, struct.Struct('<I'), struct.Struct('>I'))
     assert [field.read(bytes([0, kind, 0, 0, 0, 0, 0, 1])) for kind in (0, 6)] == [1, 0]

@@ -1,4 +1,4 @@
-"""Message definitions and type hashes: as rosbag2 writes them, and such that other people's parsers come to the same type."""
+"""Message definitions and type hashes: as rosbag2 writes them, and readable by other parsers as the same type."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_definition_includes_every_nested_type(tmp_path: Path, monkeypatch: py
 
 
 def test_idl_is_used_where_there_is_no_msg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package with .idl alone is described by that, its own title above it as well, in a form that `rosbags` parses."""
+    """A package with .idl alone is described by that, with a title above it as well, in a form that `rosbags` parses."""
     include = '#include "zoo/msg/Animal.idl"\n'
     cage = 'module zoo { module msg { struct Cage { zoo::msg::Animal animal; }; }; };\n'
     animal = 'module zoo { module msg { struct Animal { long legs; }; }; };\n'
@@ -99,7 +99,7 @@ def test_the_first_workspace_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize('name', ['nowhere/msg/Thing', 'no type', '', '../../etc/passwd', 'std_msgs/srv/X', 'a/b/c/d'])
 def test_an_unknown_type_has_an_empty_definition(name: str) -> None:
-    """An unknown type has an empty definition, which readers take for none."""
+    """An unknown type has an empty definition, which readers treat as missing."""
     assert describe(name) == ('', '', '')
 
 

@@ -125,7 +125,7 @@ def test_metadata_that_pcd_cannot_hold_is_in_a_comment(ros: Any) -> None:
 
 
 def test_underscore_fields_are_padding(ros: Any) -> None:
-    """Fields called ``_`` are padding by PCL's convention and are left out, several of them too."""
+    """Fields called ``_`` are padding by PCL's convention and are skipped, also if there are several."""
     fields = [('_', 0, 2, 4), ('x', 4, 7, 1), ('_', 8, 2, 4)]
     data = np.array([(9, 1.5, 9)], [('a', '<u4'), ('x', '<f4'), ('b', '<u4')])
     body = ros.encode(CLOUD, cloud(ros, fields, data.tobytes(), width=1, point_step=12)).object.body

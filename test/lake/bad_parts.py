@@ -1,4 +1,4 @@
-"""Row files as no robot of ours writes them."""
+"""Row files that none of our robots would write."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DATE: Final = '2026-10-28'
 
 def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor',
         of: catalog.TableSchema = catalog.OBJECTS) -> str:  # fmt: skip
-    """As a robot that may write below its own prefix puts it; its key."""
+    """Put it as a robot with permission for its prefix does; returns its key."""
     key = of.part_key(robot, DATE, name)
     path = settings.directory / catalog.BUCKET / key
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,13 +25,13 @@ def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str
 
 
 def lines(rows: Sequence[Mapping[str, Any]], kind: str = 'object', **changed: Any) -> bytes:
-    """These rows as they are, with some columns replaced: nothing is checked."""
+    """Row files of these rows, with some columns replaced: nothing is validated."""
     told = [{'row': kind, **{name: value for name, value in {**row, **changed}.items() if value is not None}} for row in rows]
     return compress(''.join(f'{json.dumps(each)}\n' for each in told).encode(), 3)
 
 
 def bomb() -> bytes:
-    """A gigabyte of one line in some kilobytes."""
+    """A gigabyte of one repeated line in some kilobytes."""
     return compress(b'{"row":"object"' + b' ' * (1 << 30), 3)
 
 

@@ -23,14 +23,14 @@ IMU = {'sink': 'objects', 'topic': '/imu', 'session': 1, 'grade': 'exact'}
 
 
 def lost(name: str, first_s: float, last_s: float, revision: int = 1, what: str = GAP, **columns: Any) -> Statement:
-    """A gap so many seconds after noon."""
+    """A gap at this many seconds after noon."""
     columns = {'kind': 'missed', 'cause': 'transport', 'count': 5, 'merged': 1, 'publisher': 'imu', **IMU, **columns}
     times = {'from_ns': NOON_NS + int(first_s * SECOND), 'to_ns': NOON_NS + int(last_s * SECOND)}
     return statement('thor', what, f'j/{name}', revision, **columns, **times)
 
 
 def mark(last_s: float, revision: int = 1, first_s: float = 0.0, **columns: Any) -> Statement:
-    """A watermark that reaches from one second after noon to another."""
+    """A watermark that covers from one second after noon to another."""
     columns = {**IMU, 'received': int(last_s * 50), 'skipped': 0, **columns}
     return complete(
         'thor', 'j', revision, from_ns=NOON_NS + int(first_s * SECOND), to_ns=NOON_NS + int(last_s * SECOND), **columns

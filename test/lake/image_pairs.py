@@ -16,7 +16,7 @@ COLOURS = np.array([[0.3, 0.3, 0.3], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float3
 
 
 def make_pair(folder: Path, *, scale: float = 1.0, with_text: bool = True) -> Path:
-    """``image_embeds`` is the image's mean color, ``text_embeds`` that of the words; another ``scale`` is another model."""
+    """``image_embeds`` is the image's mean color, ``text_embeds`` that of the words; another ``scale`` makes another model."""
     (folder / 'onnx').mkdir(parents=True)
     pixels = helper.make_tensor_value_info('pixel_values', TensorProto.FLOAT, ['batch', 3, SIDE, SIDE])
     embeds = helper.make_tensor_value_info('image_embeds', TensorProto.FLOAT, ['batch', 3])

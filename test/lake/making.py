@@ -36,7 +36,7 @@ SENSORS: Final = {
 
 
 def row(sensor: str, stamp_ns: int, robot: str = 'thor', **more: str) -> catalog.Row:
-    """The row of one object as a robot writes it; place and battery follow from the time."""
+    """The row of one object as a robot writes it; position and battery follow from the time."""
     topic, kind, extension, content_type = SENSORS[sensor]
     turn = stamp_ns % DAY_NS / DAY_NS * 48 * math.pi
     minute = stamp_ns // MINUTE_NS
@@ -53,7 +53,7 @@ def row(sensor: str, stamp_ns: int, robot: str = 'thor', **more: str) -> catalog
 
 
 def content(sensor: str, stamp_ns: int) -> bytes:
-    """What the object of a row holds."""
+    """The content of a row's object."""
     return f'{sensor} {stamp_ns} '.encode() * 20
 
 
@@ -61,7 +61,7 @@ Minute = tuple[int, list[catalog.Row]]
 
 
 def minutes(days: Sequence[int] = (0, 1), hours: Sequence[int] = (11, 12), robot: str = 'thor') -> Iterator[Minute]:
-    """(begin, rows) of every fifth minute of these hours; 0 is the day of ``NOON_NS``."""
+    """(start, rows) of every fifth minute of these hours; 0 is the day of ``NOON_NS``."""
     for day in days:
         for hour in hours:
             for minute in range(0, 60, 5):
@@ -157,7 +157,7 @@ def keys(rows: Sequence[catalog.Row]) -> list[str]:
 
 
 def merge(settings: StoreSettings) -> int:
-    """Ingest all row files, and make one file of each day; how many files of tables became larger ones."""
+    """Ingest all row files, and merge them into one file per day; returns how many files were merged."""
     source = Bucket(settings, catalog.BUCKET)
     tables = Tables.for_ingest(source)
     ingest(source, tables, Findings(lambda _: None))

@@ -1,6 +1,6 @@
 """A dataset has every message of its anchor once, with the messages of the other sensors at that time, as published.
 
-The examples that researchers copy from run as they stand.
+The examples for researchers run unchanged.
 
 Several processes read a dataset without shared state: each sample once per epoch, however they were started.
 """
@@ -59,7 +59,7 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def test_a_sample_is_what_was_published(tmp_path: Path) -> None:
-    """Picture, time, pose, and of each sensor the numbers next to it, with how far away they were."""
+    """Image, time, pose, and the nearest numbers of each sensor, with their distance in time."""
     dataset = MissionDataset(drive(tmp_path), align=ALIGN)
     assert len(dataset) == SECONDS
     for number in range(SECONDS):
@@ -79,7 +79,7 @@ def test_a_sample_is_what_was_published(tmp_path: Path) -> None:
 
 
 def test_a_window_is_the_messages_before_the_frame(tmp_path: Path) -> None:
-    """The last eight of the half second before it, oldest first, over the border of two batches; where they are missing, NaN."""
+    """The last eight of the half second before it, oldest first, across the boundary of two batches; NaN if missing."""
     dataset = MissionDataset(drive(tmp_path), align={'imu': Window(0.5, rows=8)})
     stamp = NOON_NS + 2 * SECOND
     expected = [imu_reading(stamp - step * SECOND // IMU_HZ) for step in reversed(range(8))]
@@ -111,7 +111,7 @@ def test_by_received_samples_are_what_had_arrived(tmp_path: Path) -> None:
 
 
 def test_a_causal_dataset_has_no_later_values(tmp_path: Path) -> None:
-    """Odometry comes a little after each frame: the nearest is that, the causal one is that of the second before."""
+    """Odometry arrives shortly after each frame: the nearest is that one, the causal one is that of the second before."""
     dataset = MissionDataset(drive(tmp_path), align={'odom': 1.5, 'joints': 0.2}, causal=True)
     for number in range(1, SECONDS):
         sample = dataset[number]
@@ -125,7 +125,7 @@ def test_a_causal_dataset_has_no_later_values(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('frames', ['tar', 'zip'])
 def test_an_archive_is_as_many_samples_as_it_has_frames(tmp_path: Path, frames: str) -> None:
-    """Each has its own time, its own neighbors, and a pose interpolated between those of the archives."""
+    """Each has a separate time, separate neighbors, and a pose interpolated between those of the archives."""
     dataset = MissionDataset(drive(tmp_path, frames=frames), align=ALIGN)
     assert len(dataset) == SECONDS * FRAMES_HZ
     for number in (0, 5, 11, 20):
@@ -140,7 +140,7 @@ def test_an_archive_is_as_many_samples_as_it_has_frames(tmp_path: Path, frames: 
 
 
 def test_repeats_are_separate_samples(tmp_path: Path) -> None:
-    """A frame that was stored once and seen thrice is three samples: as rows with different times, and in an archive."""
+    """A frame stored once and repeated twice is three samples: as rows with different times, and in an archive."""
     settings = folder_store(tmp_path)
     still = Drive(settings, tmp_path)
     stamps = [NOON_NS + number * SECOND // 10 for number in range(3)]
@@ -161,7 +161,7 @@ def test_repeats_are_separate_samples(tmp_path: Path) -> None:
 
 
 def test_messages_too_far_in_time_are_missing(tmp_path: Path) -> None:
-    """Numbers are NaN, a cloud has no point, the mask says so; all samples keep one shape."""
+    """Numbers are NaN, a cloud has no points, the mask shows it; all samples have the same shape."""
     settings = folder_store(tmp_path)
     partly = Drive(settings, tmp_path)
     partly.record(4, without=['imu'])
@@ -175,7 +175,7 @@ def test_messages_too_far_in_time_are_missing(tmp_path: Path) -> None:
 
 
 def test_robots_may_have_different_sensors(tmp_path: Path) -> None:
-    """One that stored nothing of a sensor has samples of the same shape as the others, all of it missing."""
+    """One without any data of a sensor has samples of the same shape as the others, with all of it missing."""
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(1)
     Drive(settings, tmp_path, 'tachi').record(1, without=['imu', 'joints', 'lidar'])
@@ -187,7 +187,7 @@ def test_robots_may_have_different_sensors(tmp_path: Path) -> None:
 
 
 def test_prefetched_objects_of_a_batch_are_released(tmp_path: Path) -> None:
-    """One frame needs few of an archive's neighbors: the others would fill the memory, batch by batch."""
+    """A frame needs few of an archive's neighbors: the others would fill the memory, batch by batch."""
     dataset = MissionDataset(drive(tmp_path, frames='tar'), align={'imu': 1.0, 'odom': 1.0})
     for number in (0, 5, 9):
         dataset.__getitems__([number])
@@ -197,7 +197,7 @@ def test_prefetched_objects_of_a_batch_are_released(tmp_path: Path) -> None:
 
 
 def test_a_known_pose_is_kept_next_to_an_unknown_one(tmp_path: Path) -> None:
-    """Odometry ends within an archive: its own pose counts for the frames whose next archive has none."""
+    """Odometry ends within an archive: the known pose counts for frames whose next archive has none."""
     settings = folder_store(tmp_path)
     still = Drive(settings, tmp_path)
     for second, more in ((0, {}), (1, {'pose': ''})):
@@ -210,13 +210,13 @@ def test_a_known_pose_is_kept_next_to_an_unknown_one(tmp_path: Path) -> None:
 
 
 def test_the_poses_of_all_samples_are_those_of_each(tmp_path: Path) -> None:
-    """Also of the frames of an archive, between which the robot walked."""
+    """Also for the frames of an archive, during which the robot moved."""
     dataset = MissionDataset(drive(tmp_path, frames='tar'))
     assert dataset.poses == pytest.approx(np.array([dataset[number]['pose'] for number in range(len(dataset))]))
 
 
 def test_incomplete_samples_can_be_dropped(tmp_path: Path) -> None:
-    """By the catalog in what is counted, and message by message in a stream."""
+    """According to the catalog for counting, and message by message in a stream."""
     settings = folder_store(tmp_path)
     partly = Drive(settings, tmp_path)
     partly.record(3, frames='tar')
@@ -231,7 +231,7 @@ def test_incomplete_samples_can_be_dropped(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('frames', ['jpeg', 'tar'])
 def test_every_way_to_read_gives_the_same_samples(tmp_path: Path, frames: str) -> None:
-    """By number, several at once, streamed, and from a copy that went through pickle."""
+    """By index, several at a time, streamed, and from a pickled copy."""
     dataset = MissionDataset(drive(tmp_path, frames=frames), align=ALIGN)
     expected = [dataset[number] for number in range(len(dataset))]
     assert all(map(same, expected, dataset.__getitems__(range(len(dataset)))))
@@ -244,7 +244,7 @@ def test_every_way_to_read_gives_the_same_samples(tmp_path: Path, frames: str) -
 
 @pytest.mark.parametrize('frames', ['jpeg', 'tar'])
 def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
-    """Objects and rows that two fetches brought, some of them twice, are the data set that the store is."""
+    """Objects and rows from two overlapping fetches are the same dataset as the store."""
     source, to = drive(tmp_path, frames=frames), tmp_path / 'data'
     for flags in ({'sensor': 'camera'}, {'robot': 'thor'}):
         rows = query.objects(source, **flags).to_pylist()
@@ -258,7 +258,7 @@ def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
 
 
 def test_a_folder_without_rows_is_not_a_dataset(tmp_path: Path) -> None:
-    """It is not there, or its files were fetched by prefix: an empty data set would say that there are no frames."""
+    """The folder does not exist, or its files were fetched by prefix: an empty dataset would mean that there are no frames."""
     (tmp_path / 'data' / 'thor' / 'camera').mkdir(parents=True)
     for folder in ('nowhere', 'data'):
         with pytest.raises(LakeError, match=f'{folder} has no catalog'):
@@ -266,7 +266,7 @@ def test_a_folder_without_rows_is_not_a_dataset(tmp_path: Path) -> None:
 
 
 def test_an_anchor_that_the_store_does_not_have_is_an_error(tmp_path: Path) -> None:
-    """Also one of the default sensors; a time without frames is a dataset without samples."""
+    """Also for a default sensor; a time without frames is a dataset without samples."""
     source = drive(tmp_path, 2)
     with pytest.raises(UnknownName, match="there is no sensor 'voxel_map'"):
         MissionDataset(source, anchor='voxel_map')
@@ -274,7 +274,7 @@ def test_an_anchor_that_the_store_does_not_have_is_an_error(tmp_path: Path) -> N
 
 
 def test_an_unknown_sensor_cannot_be_aligned(tmp_path: Path) -> None:
-    """Misspelt, or not fetched with the frames: an error, not a column of NaN."""
+    """A misspelled one, or one not fetched with the frames: an error, not a column of NaN."""
     source = drive(tmp_path, without=['imu'])
     for name in ('odometer', 'imu'):
         with pytest.raises(LakeError, match=f'{name} has no object in the time of camera'):
@@ -282,7 +282,7 @@ def test_an_unknown_sensor_cannot_be_aligned(tmp_path: Path) -> None:
 
 
 def test_repeats_survive_a_merge(tmp_path: Path) -> None:
-    """Rows of one key and different times are different rows, also after files of tables were merged."""
+    """Rows with the same key and different times are different, also after files of tables were merged."""
     settings = folder_store(tmp_path)
     still = Drive(settings, tmp_path)
     one = still.one('sensor_msgs/msg/CompressedImage', [NOON_NS], [still.frame(6)])
@@ -294,7 +294,7 @@ def test_repeats_survive_a_merge(tmp_path: Path) -> None:
 
 
 def test_an_image_is_averaged_when_it_is_resized(tmp_path: Path) -> None:
-    """A picture of half the size is the average, not every other pixel."""
+    """An image of half the size is the average, not every other pixel."""
     source = drive(tmp_path, 1)
     small = MissionDataset(source, size=(12, 16))[0]['image']
     whole = MissionDataset(source)[0]['image'].astype(float)
@@ -304,7 +304,7 @@ def test_an_image_is_averaged_when_it_is_resized(tmp_path: Path) -> None:
 
 
 def test_the_selection_is_that_of_the_catalog(tmp_path: Path) -> None:
-    """The flags restrict the frames but not the aligned sensors; several robots are not mixed."""
+    """The flags restrict the frames but not the aligned sensors; robots are not mixed."""
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(4)
     Drive(settings, tmp_path, 'tachi').record(4, without=['odom'])
@@ -321,7 +321,7 @@ def test_the_selection_is_that_of_the_catalog(tmp_path: Path) -> None:
 
 
 def test_changed_content_is_an_error(tmp_path: Path) -> None:
-    """Is an error that names the object, as is an object that is gone."""
+    """The error names the object, as it does for a missing object."""
     source = drive(tmp_path, 2)
     dataset = MissionDataset(source)
     path = source.settings.directory / BUCKET / 'thor/camera/20261028/120000_front.jpg'
@@ -338,7 +338,6 @@ def test_changed_content_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('frames', ['jpeg', 'tar'])
 def test_an_s3_server_gives_the_same_samples(tmp_path: Path, seaweed: Tower, frames: str) -> None:
-    """The same samples as from a folder of the same objects."""
     robot = f'thor{frames}'
     ours = Drive(seaweed.store_settings(), tmp_path / 's3', robot)
     there = Drive(folder_store(tmp_path), tmp_path / 'folder', robot)
@@ -377,14 +376,14 @@ def test_the_index_of_a_million_objects_is_small() -> None:
      ('no hex', '00' * 32), ('ab ' * 32, '00' * 32)],
 )  # fmt: skip
 def test_an_invalid_checksum_matches_no_content(told: str | None, kept: str) -> None:
-    """It is kept as 32 bytes: only what is not known at all is not compared."""
+    """It is stored in 32 bytes: only an unknown checksum skips the comparison."""
     row = {**dict.fromkeys(NEEDED), 'robot': 'thor', 'sensor': 'camera', 'key': 'thor/camera/1.jpg', 'bucket': BUCKET, 'bytes': 9,
            'sha256': told, 't_start_ns': NOON_NS}  # fmt: skip
     assert Track.of(pa.Table.from_pylist([row], schema=narrow(NEEDED))).object(0).sha256 == kept
 
 
 def test_rows_of_several_frames_are_one_track_in_order() -> None:
-    """The same object from two frames is there once, and words have one dictionary."""
+    """The same object from two frames is there once, and strings have one dictionary."""
 
     def frame(*numbers: int) -> pa.Table:
         same = {**dict.fromkeys(NEEDED), 'robot': 'thor', 'sensor': 'camera', 'bytes': 9}
@@ -437,7 +436,7 @@ def test_a_policy_is_trained_and_its_run_is_in_mlflow(tmp_path: Path) -> None:
 @pytest.mark.seaweedfs
 @pytest.mark.long('processes that import much')
 def test_several_processes_evaluate_all_frames(tmp_path: Path, seaweed: Tower) -> None:
-    """Every frame of the robot once, and no secret in what the processes say."""
+    """Every frame of the robot once, and no secret in the output of the processes."""
     pytest.importorskip('daft')
     drive = Drive(seaweed.store_settings(), tmp_path, 'fleetrobot')
     drive.record(5, without=['imu', 'joints', 'lidar', 'lowstate', 'odom'])
@@ -453,7 +452,7 @@ def test_several_processes_evaluate_all_frames(tmp_path: Path, seaweed: Tower) -
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('example', ['train_navigation_policy.py', 'fleet_frames.py'])
 def test_each_example_has_a_usage_line(example: str) -> None:
-    """``--help`` names what it needs."""
+    """``--help`` names the requirements."""
     if example.startswith('train') and importlib.util.find_spec('torch') is None:
         pytest.skip('torch is not installed (the extra "train")')
     ran = run(example, '--help')
@@ -475,7 +474,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
 
 @pytest.fixture
 def in_worker(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The worker information that torch provides, and that torch is loaded."""
+    """The worker information from torch, with torch loaded."""
     told = types.SimpleNamespace(id=0, num_workers=1)
     module: Any = types.ModuleType('torch.utils.data')
     module.get_worker_info = lambda: told
@@ -495,7 +494,7 @@ def stamps(stream: Any) -> list[int]:
 
 
 def test_workers_cover_all_shards_completely(source: Bucket, in_worker: Any) -> None:
-    """Three workers: no archive is read by two, every frame comes once; a DataLoader takes the stream for an IterableDataset."""
+    """Three workers: no archive is read by two, every frame is read once; a DataLoader accepts it as an IterableDataset."""
     frames = MissionDataset(source)
     got = []
     for number in range(3):
@@ -510,7 +509,7 @@ def test_workers_cover_all_shards_completely(source: Bucket, in_worker: Any) -> 
 
 
 def test_ranks_split_what_their_workers_split(source: Bucket, in_worker: Any) -> None:
-    """Two processes of two workers each: four shares of one whole."""
+    """Two processes of two workers each: four complementary shares."""
     frames, got = MissionDataset(source), []
     for rank in range(2):
         for number in range(2):
@@ -521,7 +520,7 @@ def test_ranks_split_what_their_workers_split(source: Bucket, in_worker: Any) ->
 
 
 def test_epochs_differ_and_can_be_repeated(source: Bucket) -> None:
-    """Each iteration is another epoch's order, ``set_epoch`` names one, and seeds differ."""
+    """Each iteration uses another epoch's order, ``set_epoch`` selects one, and seeds differ."""
     frames = MissionDataset(source)
     stream = frames.stream(shuffle=True, seed=7)
     first, second = stamps(stream), stamps(stream)
@@ -552,7 +551,7 @@ def test_a_shuffled_stream_mixes_archives_and_reads_each_once(source: Bucket) ->
 
 
 def test_a_shard_of_single_objects_is_bounded() -> None:
-    """A track of single frames is cut every 64 objects, an archive is one shard."""
+    """A track of single frames is split every 64 objects, an archive is one shard."""
     counts = np.array([1] * 70 + [30, 30] + [1] * 2)
     track = types.SimpleNamespace(count=counts)
     cut = shards.shards([track], [np.arange(len(counts))])  # type: ignore[list-item]
@@ -577,7 +576,7 @@ def test_prefetching_is_bounded(source: Bucket, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('way', ['fork', 'spawn'])
 def test_a_process_started_after_reading_reads_on_its_own(tmp_path: Path, seaweed: Tower, way: str) -> None:
-    """Forked or spawned, it reads from the server what its parent reads, though the parent has connections and threads."""
+    """Forked or spawned, it reads the same from the server, though its parent has connections and threads."""
     robot = f'worker{way}'
     Drive(seaweed.store_settings(), tmp_path, robot).record(4)
     frames = MissionDataset(Bucket(seaweed.store_settings(), BUCKET), robot=robot)
@@ -597,7 +596,7 @@ def test_a_process_started_after_reading_reads_on_its_own(tmp_path: Path, seawee
 
 
 def test_a_pickled_dataset_is_a_value(source: Bucket) -> None:
-    """No thread, lock or connection goes along, and neither does what was read."""
+    """It contains no threads, locks or connections, and no cached data."""
     frames = MissionDataset(source)
     before = len(pickle.dumps(frames))
     frames.__getitems__(range(len(frames)))
@@ -607,7 +606,7 @@ def test_a_pickled_dataset_is_a_value(source: Bucket) -> None:
 
 @pytest.mark.long('a process of its own')
 def test_importing_it_loads_no_torch() -> None:
-    """Nor is it needed to make a data set of nothing."""
+    """Nor does creating an empty dataset."""
     load = 'import sys; from shadowhound_data_logger.lake import MissionDataset'
     program = f'{load}; print("torch" in sys.modules, MissionDataset.__name__)'
     ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)

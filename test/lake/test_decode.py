@@ -1,6 +1,6 @@
 """Contents become the same arrays as with independent readers; invalid content is a LakeError.
 
-Pictures, clouds, archives, records and summaries that claim more than there is: an error, before it takes memory.
+Images, clouds, archives, records and summaries that declare more than they contain: an error, before memory is allocated.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def test_images_are_read_like_pillow_does() -> None:
 
 
 def test_clouds_are_read_like_pypcd4_does(tmp_path: Path) -> None:
-    """X y z intensity in this order whatever the file's; what is not there is NaN."""
+    """X y z intensity in this order for any order in the file; missing fields are NaN."""
     points = np.random.default_rng(2).normal(size=(50, 4)).astype(np.float32)
     cloud = PointCloud.from_points(points, ('intensity', 'z', 'y', 'x'), (np.float32,) * 4)
     cloud.save(tmp_path / 'a.pcd', encoding=Encoding.BINARY)
@@ -80,7 +80,7 @@ def test_clouds_are_read_like_pypcd4_does(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('kind', ['tar', 'zip'])
 def test_archives_give_each_message_in_order(tmp_path: Path, kind: str) -> None:
-    """Each message in order; one that repeats the last has its content."""
+    """Each message in order; a repeat has the content of the previous one."""
     still = Drive(folder_store(tmp_path), tmp_path)
     stamps = [NOON_NS + number for number in (0, 10, 20, 30)]
     made = still.one(COMPRESSED, stamps, [still.frame(number) for number in (1, 1, 2, 2)], format=kind, batch_s=1.0, dedup=True)
@@ -92,7 +92,7 @@ def test_archives_give_each_message_in_order(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize('unknown', ['orientation', 'angular_velocity', 'linear_acceleration'])
 def test_what_an_imu_marks_as_unknown_is_nan(unknown: str) -> None:
-    """By -1 as the first element of its covariance; the -1 of another element is a covariance, and 0 is not known to be one."""
+    """With -1 as the first element of its covariance; -1 elsewhere is a covariance, and 0 need not mean unknown."""
 
     def sample(stamp_ns: int, first: float) -> dict[str, Any]:
         found: dict[str, Any] = {'stamp_ns': stamp_ns}
@@ -108,7 +108,7 @@ def test_what_an_imu_marks_as_unknown_is_nan(unknown: str) -> None:
 
 
 def test_a_place_without_a_fix_is_nan() -> None:
-    """A receiver that has no fix (``status.status`` -1) repeats the last place, or reports 0."""
+    """A receiver without a fix (``status.status`` -1) repeats the last position, or reports 0."""
     samples = [{'stamp_ns': number, 'status': {'status': status}, 'latitude': 48.1, 'longitude': 11.5, 'altitude': 520.0}
                for number, status in enumerate((-1, 0, 2))]  # fmt: skip
     found = table(samples, 'sensor_msgs/msg/NavSatFix', ('latitude', 'longitude', 'altitude', 'status.status'), 0).values
@@ -117,7 +117,7 @@ def test_a_place_without_a_fix_is_nan() -> None:
 
 
 def test_records_become_numbers() -> None:
-    """Lists and nested messages are columns in order, null is NaN, texts are skipped, times get their offset and are sorted."""
+    """Lists and nested messages are columns in order, null is NaN, strings are skipped, times get their offset and are sorted."""
     samples = [{'stamp_ns': 20, 'a': {'b': [1, 2]}, 'c': None, 'text': 'x', 'm': [{'q': 1}, {'q': 2}]},
                {'stamp_ns': 10, 'a': {'b': [3, 4]}, 'c': 5, 'text': 'y', 'm': [{'q': 3}, {'q': 4}]}]  # fmt: skip
     found = decode.records(orjson.dumps({'samples': samples}))
@@ -132,7 +132,7 @@ def test_records_become_numbers() -> None:
 @settings(derandomize=True, deadline=None, max_examples=examples(60))
 @given(st.binary(max_size=80), st.sampled_from(['', 'ffd8ffe0', '89504e470d0a1a0a', '49492a00']))
 def test_invalid_content_is_a_lake_error(body: bytes, magic: str) -> None:
-    """Whatever reader it is given to."""
+    """For any reader."""
     given_ = bytes.fromhex(magic) + body
     for read in (decode.image, decode.cloud, lambda it: decode.members(it, 'zip')):
         with pytest.raises(LakeError):
@@ -142,7 +142,7 @@ def test_invalid_content_is_a_lake_error(body: bytes, magic: str) -> None:
 
 
 def test_broken_archives_are_an_error() -> None:
-    """A tar that ends in a file, a member without its content, and a PCD that is too short, a picture of 400 megapixels."""
+    """A tar that ends inside a file, a member without content, a PCD that is too short, an image of 400 megapixels."""
     file = io.BytesIO()
     with tarfile.open(fileobj=file, mode='w') as made:
         entry = tarfile.TarInfo('1.json')
@@ -178,7 +178,7 @@ def test_broken_archives_are_an_error() -> None:
 def test_arrivals_follow_from_those_of_first_and_last(
     stamps_s: list[float], received_s: tuple[float, float], expected_s: list[float]
 ) -> None:
-    """As far apart as the stamps where the offset is constant, otherwise evenly spread."""
+    """With the spacing of the stamps if the offset is constant, otherwise evenly spread."""
     first, last = (round(each * SECOND) for each in received_s)
     stamps = np.array([round(each * SECOND) for each in stamps_s], np.int64)
     found = arrivals(stamps + first - stamps[0], first, last)
@@ -186,11 +186,11 @@ def test_arrivals_follow_from_those_of_first_and_last(
 
 
 SIDE = 12_000
-"""Of a picture of 144 megapixels, 430 MB: below what Pillow itself refuses."""
+"""An image of 144 megapixels, 430 MB: below the limit of Pillow."""
 
 
 def png(side: int) -> bytes:
-    """All black, whatever its size: rows that are alike compress a thousandfold."""
+    """All black, of any size: equal rows compress a thousandfold."""
     packer = zlib.compressobj(9)
     rows = b''.join(packer.compress(bytes(1 + side)) for _ in range(side)) + packer.flush()
 
@@ -202,7 +202,7 @@ def png(side: int) -> bytes:
 
 
 def huge_jpeg(side: int) -> bytes:
-    """One that says that it is so large."""
+    """A JPEG that declares this size."""
     file = io.BytesIO()
     Image.new('RGB', (16, 16)).save(file, 'JPEG')
     body = file.getvalue()
@@ -211,7 +211,7 @@ def huge_jpeg(side: int) -> bytes:
 
 
 def tiff(side: int) -> bytes:
-    """Without a pixel behind its claim."""
+    """A TIFF without any pixels."""
     tags = [(256, side), (257, side), (258, 8), (259, 1), (262, 1), (273, 8), (277, 1), (278, side), (279, side * side)]
     entries = b''.join(struct.pack('<HHII', tag, 4, 1, value) for tag, value in tags)
     return b'II*\0' + struct.pack('<I', 8) + struct.pack('<H', len(tags)) + entries + bytes(4)
@@ -231,7 +231,7 @@ except LakeError as error:
 
 @pytest.mark.parametrize('make', [png, *(pytest.param(each, marks=pytest.mark.long('as for png')) for each in (huge_jpeg, tiff))])
 def test_an_image_that_is_too_large_is_refused_by_its_header(tmp_path: Path, make: object) -> None:
-    """In a process that could not even hold a half of it, and by the contact sheet, too."""
+    """In a process that could not hold half of it, and by the contact sheet, too."""
     body = make(SIDE)  # type: ignore[operator]
     (tmp_path / 'evil').write_bytes(body)
     command = [sys.executable, '-c', READ, str(tmp_path / 'evil'), str(LIMIT_BYTES // 4)]
@@ -244,7 +244,7 @@ def test_an_image_that_is_too_large_is_refused_by_its_header(tmp_path: Path, mak
 
 
 def test_only_our_image_formats_are_tried() -> None:
-    """Pillow knows dozens more, some by way of other programs."""
+    """Pillow supports dozens more, some through external programs."""
     for kind in ('GIF', 'BMP', 'EPS', 'PDF', 'ICO'):
         file = io.BytesIO()
         Image.new('RGB', (8, 8)).save(file, kind)
@@ -273,14 +273,14 @@ def pcd(**changed: str) -> bytes:
     ids=str,
 )  # fmt: skip
 def test_a_cloud_has_the_points_that_are_there(changed: dict[str, str]) -> None:
-    """What its header claims beyond that is an error."""
+    """Declaring more in the header is an error."""
     assert decode.cloud(pcd()).shape == (2, 4)
     with pytest.raises(LakeError, match='not a PCD'):
         decode.cloud(pcd(**changed))
 
 
 def sparse_tar() -> bytes:
-    """A member of no bytes that says that it is a file of a terabyte with a hole."""
+    """An empty member declared as a file of a terabyte with a hole."""
     file = io.BytesIO()
     with tarfile.open(fileobj=file, mode='w', format=tarfile.PAX_FORMAT) as made:
         entry = tarfile.TarInfo('GNUSparseFile.0/1.jpg')
@@ -327,7 +327,7 @@ def packed_zip(how: int) -> bytes:
 )  # fmt: skip
 @pytest.mark.long('archives of many')
 def test_an_archive_cannot_exceed_its_size(make: Callable[[], bytes], kind: str) -> None:
-    """Robots store what is in it as it is."""
+    """Robots store its contents unchanged."""
     body = make()
     with pytest.raises(LakeError, match=f'the {kind} cannot be read'):
         decode.members(body, kind)
@@ -347,7 +347,7 @@ def test_records_have_times(told: object) -> None:
 
 
 def test_records_that_are_too_deep_or_too_large() -> None:
-    """Both are errors of ours, as are lists of unlike lengths."""
+    """Both are LakeErrors, as are lists of different lengths."""
     deep: object = 5
     for _ in range(1000):
         deep = {'a': deep}
@@ -359,7 +359,7 @@ def test_records_that_are_too_deep_or_too_large() -> None:
 
 
 def test_at_most_the_size_in_the_row_is_read() -> None:
-    """And none that is larger than any that is decoded."""
+    """And no object above the maximum size for decoding."""
     asked: list[int] = []
 
     def read(bucket: str, key: str, most: int) -> bytes:
@@ -387,7 +387,7 @@ def test_an_invalid_summary_affects_only_its_mission(tmp_path: Path, told: bytes
 
 
 def test_a_row_that_claims_a_million_messages_is_skipped(tmp_path: Path) -> None:
-    """A data set would have as many samples."""
+    """A dataset would have that many samples."""
     from lake import bad_parts
 
     from shadowhound_data_logger import lake
@@ -406,7 +406,7 @@ def test_a_row_that_claims_a_million_messages_is_skipped(tmp_path: Path) -> None
 
 
 def test_documents_are_bounded() -> None:
-    """Of those who read them any depth, size or number of values is an error in a second."""
+    """Any depth, size or number of values is an error within a second in all readers."""
     for content in (b'[' * 200_000, b' ' * (17 << 20)):
         with pytest.raises(ValueError, match=r'deep|not read'):
             from_json(content)

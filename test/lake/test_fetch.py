@@ -1,6 +1,6 @@
 """The requested objects are in the folder, complete and verified; existing ones are not downloaded again.
 
-A fetch that is killed again and again: what was whole stays and is not asked for again, and nothing else is left behind.
+A fetch that is killed repeatedly: complete files stay and are not downloaded again, and nothing else is left behind.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Asked(DirectoryStore):
 
 
 class Real(ObstoreStore):
-    """The same, of a server."""
+    """The same for a real server."""
 
     def __init__(self, settings: StoreSettings) -> None:
         super().__init__(settings, UploadSettings())
@@ -90,7 +90,7 @@ class Real(ObstoreStore):
 
 
 def run(store: Asked | Real, to: Path, **how: Any) -> FetchResult:
-    """Everything under the prefix."""
+    """Fetch everything under the prefix."""
     requests = how.pop('requests', None) or under(Bucket(store.settings, BUCKET), PREFIX)
     return fetch(requests, to, store, **how)
 
@@ -100,7 +100,7 @@ def whole(to: Path) -> bool:
 
 
 def test_a_prefix_keeps_its_layout_and_a_second_run_moves_nothing(settings: StoreSettings, tmp_path: Path) -> None:
-    """Exactly the objects under it, each at DIR/KEY; then one listing and not one object more."""
+    """Exactly the objects under it, each at DIR/KEY; the second run makes one listing and requests no object."""
     source, to = Asked(settings), tmp_path / 'data'
     assert run(source, to) == FetchResult(moved=COUNT, bytes=sum(map(len, OBJECTS.values())))
     assert whole(to)
@@ -117,7 +117,7 @@ def test_a_prefix_need_not_end_at_a_folder(settings: StoreSettings, prefix: str)
 
 
 def test_locally_changed_files_are_fetched_again(settings: StoreSettings, tmp_path: Path) -> None:
-    """A file that is gone, of another size, or written since; only those."""
+    """Only files that are missing, have another size, or were written since."""
     source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
     gone, short, touched, *_ = OBJECTS
@@ -131,7 +131,7 @@ def test_locally_changed_files_are_fetched_again(settings: StoreSettings, tmp_pa
 
 
 def test_verify_finds_what_has_the_right_size_and_time(settings: StoreSettings, tmp_path: Path) -> None:
-    """A bit that rotted on this disk."""
+    """A bit flipped on this disk."""
     source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
     rotten = to / next(iter(OBJECTS))
@@ -145,7 +145,7 @@ def test_verify_finds_what_has_the_right_size_and_time(settings: StoreSettings, 
 
 
 def test_files_of_another_program_are_verified_and_not_fetched(settings: StoreSettings, tmp_path: Path) -> None:
-    """A folder that `aws s3 sync` or a lost memory left: the content is compared, nothing is transferred."""
+    """For a folder from `aws s3 sync` or without its record: the content is compared, nothing is transferred."""
     source, to = Asked(settings), tmp_path / 'data'
     for key, body in OBJECTS.items():
         (to / key).parent.mkdir(parents=True, exist_ok=True)
@@ -179,14 +179,14 @@ def test_content_damaged_in_transit_is_fetched_again(settings: StoreSettings, tm
 
 
 def test_the_checksum_of_the_catalog_counts(settings: StoreSettings, tmp_path: Path) -> None:
-    """An object that is not what its row says is a failure, whatever it says of itself."""
+    """An object that differs from its row is a failure, whatever its metadata says."""
     key = next(iter(OBJECTS))
     found = run(Asked(settings), tmp_path / 'data', requests=[FetchRequest(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
 
 
 def test_an_object_without_a_checksum_is_compared_by_size(settings: StoreSettings, tmp_path: Path) -> None:
-    """It is reported, and checked again the next time."""
+    """It is reported, and checked again next time."""
     key = next(iter(OBJECTS))
     (settings.directory / '.metadata' / BUCKET / f'{key}.json').unlink()
     source = Asked(settings)
@@ -207,7 +207,7 @@ def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path,
 
 @pytest.mark.parametrize('robot', ['{tmp}/evil', '../../evil', '..'])
 def test_no_row_leads_out_of_the_folder(tmp_path: Path, robot: str) -> None:
-    """Nor does what a row calls its robot: such a row is not kept, the others are."""
+    """Also by the robot's name in a row: such a row is skipped, the others are kept."""
     to, named = tmp_path / 'a' / 'data', robot.format(tmp=tmp_path)
     keep_rows(to, [row('camera', NOON_NS), {**row('camera', NOON_NS), 'robot': named}])
     kept = [path for path in tmp_path.rglob('*') if path.is_file()]
@@ -227,7 +227,7 @@ def test_an_object_that_cannot_be_fetched_stops_no_other(settings: StoreSettings
 
 
 def test_an_unreachable_store_ends_it(settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not each of a million objects is tried; what concerns all of them is raised."""
+    """It does not try each of a million objects; an error that concerns all is raised."""
     monkeypatch.setattr(retry, 'BASE_S', 0.001)
     tried = 0
 
@@ -249,13 +249,13 @@ def test_an_unreachable_store_ends_it(settings: StoreSettings, tmp_path: Path, m
 
 
 def test_only_one_process_writes_to_a_folder(settings: StoreSettings, tmp_path: Path) -> None:
-    """The second says so."""
+    """The second gets an error."""
     with Fetched(tmp_path / 'data'), pytest.raises(LakeError, match='another fetch'):
         run(Asked(settings), tmp_path / 'data')
 
 
 def test_unsynced_files_are_verified_after_a_power_cut(settings: StoreSettings, tmp_path: Path) -> None:
-    """Noted by a run that was killed, in another boot: the file is hashed, and moved if it is not whole."""
+    """Recorded by a killed run in another boot: the file is hashed, and moved if it is not complete."""
     source, to = Asked(settings), tmp_path / 'data'
     run(source, to)
     with closing(sqlite3.connect(to / '.fetch' / 'files.db')) as db, db:
@@ -271,7 +271,7 @@ def test_unsynced_files_are_verified_after_a_power_cut(settings: StoreSettings, 
 
 
 def test_progress_adds_up(settings: StoreSettings, tmp_path: Path) -> None:
-    """The reported bytes and objects, including existing ones, are those that were requested."""
+    """The reported bytes and objects, including existing ones, equal those requested."""
     told = [0, 0]
 
     def tell(size: int, objects: int) -> None:
@@ -292,7 +292,7 @@ def real(seaweed: Tower, tmp_path_factory: pytest.TempPathFactory) -> Tower:
 
 @pytest.mark.seaweedfs
 def test_objects_are_fetched_from_an_s3_server(real: Tower, tmp_path: Path) -> None:
-    """The same over S3, with an empty object and one of several pieces; the second run asks for no object."""
+    """The same over S3, with an empty object and one of several pieces; the second run requests no object."""
     with closing(open_store(real.store_settings(), UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/rosbags/large/0.mcap', os.urandom(5 << 20))
         add(store, tmp_path / 'tmp', 'thor/rosbags/large/empty', b'')
@@ -361,21 +361,21 @@ def front(filled: Tower) -> Iterator[Counting]:
 
 
 def complete_files(to: Path) -> set[str]:
-    """The keys whose files have the right content; every file with a key's name has."""
+    """The keys with intact files; every file with a key's name is intact."""
     found = {str(path.relative_to(to)): path for path in (to / ROBOT / 'camera').rglob('*.jpg')}
     assert all(hashlib.sha256(path.read_bytes()).hexdigest() == SUMS[key] for key, path in found.items())
     return set(found)
 
 
 def left_over(to: Path) -> list[str]:
-    """Files that are neither objects nor their rows nor what a next fetch has to know."""
+    """Files other than objects, their rows and the record for the next fetch."""
     found = {str(path.relative_to(to)) for path in to.rglob('*') if path.is_file()} - set(KEYS)
     return sorted(name for name in found if not KEPT.fullmatch(name))
 
 
 @pytest.mark.seaweedfs
 def test_half_written_rows_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed at that moment they are not there, and what there was of them goes with the next fetch."""
+    """Killed at that moment they do not exist, and the next fetch removes the remains."""
     said = catalog.row_of('sensor-data', f'{ROBOT}/camera/x.jpg', 1, 'image/jpeg', {'t_start_ns': str(NOON_NS)})
 
     def die(_: object, __: object) -> None:
@@ -397,7 +397,7 @@ def test_half_written_rows_are_ignored(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_killed_fetch_downloads_each_object_once(
     filled: Tower, front: Counting, tmp_path: Path, kills: int, asked: list[str]
 ) -> None:
-    """Every file that appears is whole, at any moment; after each kill the next run asks only for what is not there."""
+    """Every file that appears is complete, at any moment; after each kill the next run requests only missing objects."""
     to = tmp_path / 'data'
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'fetch', *asked, '--to', str(to)]
     environ = {**os.environ, **filled.environment(), 'AWS_ENDPOINT_URL': front.url}
@@ -416,6 +416,6 @@ def test_a_killed_fetch_downloads_each_object_once(
     begun, front.limit = len(front.got), sys.maxsize
     last = subprocess.run(command, env=environ, check=True, capture_output=True, text=True, timeout=120)
     assert f'{len(there)} were there already' in last.stdout.replace(',', '')
-    assert set(front.got[begun:]) == set(KEYS) - there, 'twice is what the killed one asked for in its last instant'
+    assert set(front.got[begun:]) == set(KEYS) - there, 'only the last request of a killed run may be repeated'
     assert complete_files(to) == set(KEYS)
     assert left_over(to) == []

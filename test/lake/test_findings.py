@@ -1,4 +1,4 @@
-"""A robot's bad part of the catalog or of the gap journal is skipped, named and counted; every command answers with the rest."""
+"""A robot's invalid part of the catalog or of the gap journal is skipped, named and counted; every command handles the rest."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from shadowhound_data_logger.lake.gaps import coverage, known, of_rows
 from shadowhound_data_logger.stores import open_store
 
 LIMIT_BYTES = 3 << 30
-"""Of addresses: the threads of delta-rs reserve most of them. The commands use 0.2 GB of memory."""
+"""Address space: the threads of delta-rs reserve most of it. The commands use 0.2 GB of memory."""
 ROWS = [row('camera', NOON_NS + number * 10**9) for number in range(1, 4)]
 THEIRS = [row('camera', NOON_NS + number * 10**9, robot='tachi') for number in range(1, 4)]
 TEXTS = [each['topic'] for each in ROWS]
@@ -51,7 +51,7 @@ BAD: dict[str, Callable[[], bytes]] = {
     'no key': lambda: bad_parts.lines(ROWS, key=None),
     'of tachi': lambda: parts.encode(THEIRS),
     'of nobody': lambda: parts.encode([{**each, 'key': 'x.jpg'} for each in ROWS]),
-    'thor who says that he is tachi': lambda: parts.encode([{**each, 'robot': 'tachi'} for each in ROWS]),
+    'thor with the rows of tachi': lambda: parts.encode([{**each, 'robot': 'tachi'} for each in ROWS]),
     'a bucket that is a path': lambda: parts.encode([{**each, 'bucket': '../../etc'} for each in ROWS]),
     'a year of six digits': lambda: parts.encode([{**each, 't_start': (1 << 62)} for each in ROWS]),
     'a size below nothing': lambda: parts.encode([{**each, 'bytes': -5} for each in ROWS]),
@@ -59,12 +59,12 @@ BAD: dict[str, Callable[[], bytes]] = {
     'a row of another table': lambda: parts.encode([mark(1)], GAPS),
 }  # fmt: skip
 FEW = ('empty', 'garbage', 'a text for a number')
-"""Tried by themselves as well."""
+"""Also tried separately."""
 
 
 @pytest.fixture(scope='module')
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An hour of thor and some parts of tachi, all sound, and what their rows speak of."""
+    """An hour of thor and some parts of tachi, all valid, and the objects of their rows."""
     root = tmp_path_factory.mktemp('sound')
     settings = folder_store(root)
     rows = fill(settings, root / 'tmp', days=(0,), hours=(12,))
@@ -84,7 +84,7 @@ def home(sound: Path, tmp_path: Path) -> Path:
 
 
 def good(home: Path) -> list[str]:
-    """The keys of all rows that count."""
+    """The keys of all valid rows."""
     return sorted(lake.objects(Bucket(folder_store(home), catalog.BUCKET))['key'].to_pylist())
 
 
@@ -100,7 +100,7 @@ ALONE = [pytest.param([kind], marks=pytest.mark.long('alone')) for kind in FEW]
 
 @pytest.mark.parametrize('kinds', [BAD, *ALONE], ids=['all', *FEW])
 def test_a_bad_part_affects_no_other_robot(home: Path, kinds: Collection[str]) -> None:
-    """``query`` answers with all other rows, names each such part, and its exit code says that there is one."""
+    """``query`` returns all other rows, names each such part, and its exit code shows that there is one."""
     before = good(home)
     assert run(query, home).return_value == 0
     keys = [bad_parts.put(folder_store(home), BAD[kind](), f'thor_bad{number}') for number, kind in enumerate(kinds)]
@@ -115,7 +115,7 @@ def test_a_bad_part_affects_no_other_robot(home: Path, kinds: Collection[str]) -
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('kind', [*FEW, 'of tachi', 'a bomb'])
 def test_every_command_continues_without_it(home: Path, tmp_path: Path, kind: str) -> None:
-    """``lake verify``, ``fetch``, ``lake reindex`` and ``lake ingest``: the others are verified, fetched, known and ingested."""
+    """``lake verify``, ``fetch``, ``lake reindex`` and ``lake ingest``: the others are verified, fetched, listed and ingested."""
     before = good(home)
     key = bad_parts.put(folder_store(home), BAD[kind]())
     assert run(lake_command, home, 'ingest').return_value == 1, 'it names what it ingests now'
@@ -135,7 +135,7 @@ def test_every_command_continues_without_it(home: Path, tmp_path: Path, kind: st
 
 
 def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answered(home: Path) -> None:
-    """A robot's part may only speak of that robot's keys, in whatever bucket."""
+    """A robot's part may only have that robot's keys, in any bucket."""
     mine = [{**ROWS[0], 'key': 'thor/rosbags/a/a_0.mcap'}, {**ROWS[0], 'key': 'thor/patrol.csv', 'bucket': 'trajectories'}]
     before = good(home)
     key = bad_parts.put(folder_store(home), parts.encode([*mine, *THEIRS]))
@@ -148,7 +148,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
 
 
 def test_a_dataset_reports_what_it_skips(home: Path) -> None:
-    """And has all the rest."""
+    """And has all other data."""
     source = Bucket(folder_store(home), catalog.BUCKET)
     count = len(lake.MissionDataset(source))
     key = bad_parts.put(folder_store(home), b'')
@@ -159,7 +159,7 @@ def test_a_dataset_reports_what_it_skips(home: Path) -> None:
 
 
 def test_a_folder_name_does_not_let_a_robot_write_rows_of_another(home: Path) -> None:
-    """Folders that are not dates, and names that are not robots, are not part of the catalogue."""
+    """Folders that are not dates, and names that are not robots, are not part of the catalog."""
     before = good(home)
     root = home / 'store' / catalog.BUCKET
     for folder in (
@@ -180,7 +180,7 @@ def test_a_folder_name_does_not_let_a_robot_write_rows_of_another(home: Path) ->
 
 @pytest.mark.long('commands in little memory')
 def test_a_decompression_bomb_is_skipped_in_little_memory(home: Path) -> None:
-    """``query`` and ``lake ingest`` end normally and name it."""
+    """``query`` and ``lake ingest`` exit normally and name it."""
     key = bad_parts.put(folder_store(home), bad_parts.bomb())
     for arguments in (('query', '--format', 'keys'), ('lake', 'ingest')):
         ran = in_little_memory(home, *arguments)
@@ -215,7 +215,7 @@ BAD_GAPS: dict[str, Callable[[], bytes]] = {
     'a number for an id': lambda: bad_parts.lines(GAP_ROWS, 'gap', id=1),
     'no revision': lambda: bad_parts.lines(GAP_ROWS, 'gap', revision=None),
     'of tachi': lambda: with_(robot='tachi'),
-    'a kind of statement that is none': lambda: with_(what='forget'),
+    'an unknown kind of statement': lambda: with_(what='forget'),
     'an end before the beginning': lambda: with_(to_ns=0),
     'a year of six digits': lambda: with_(t_to=1 << 62),
     'a revision below nothing': lambda: with_(revision=-1),
@@ -238,7 +238,7 @@ def run_verb(command: Callable[..., object], gaps_home: Path, *arguments: str) -
 
 @pytest.mark.parametrize('kind', BAD_GAPS)
 def test_a_bad_part_of_the_gap_journal_affects_no_other_robot(gaps_home: Path, kind: str) -> None:
-    """``query``, ``lake coverage`` and ``known`` answer with the rest, name the part, and say that there is one."""
+    """``query``, ``lake coverage`` and ``known`` return the rest, name the part, and report that there is one."""
     source = Bucket(folder_store(gaps_home), catalog.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source)
     assert [gap.count for gap in before.gaps] == [5]
@@ -255,7 +255,7 @@ def test_a_bad_part_of_the_gap_journal_affects_no_other_robot(gaps_home: Path, k
 
 
 def test_ingest_skips_a_bad_part(gaps_home: Path) -> None:
-    """The others are merged; it stays as it is."""
+    """The others are merged; it is not changed."""
     tell(folder_store(gaps_home), gaps_home, lost('2', 700, 701), name='b')
     key = bad_parts.put(folder_store(gaps_home), BAD_GAPS['a text for a number'](), of=GAPS)
     source = Bucket(folder_store(gaps_home), catalog.BUCKET)
@@ -267,7 +267,7 @@ def test_ingest_skips_a_bad_part(gaps_home: Path) -> None:
 
 
 def test_no_robot_reports_gaps_of_another(gaps_home: Path) -> None:
-    """Statements of tachi with the names of thor's change nothing that thor told."""
+    """Statements of tachi with the names of thor's do not change those of thor."""
     source = Bucket(folder_store(gaps_home), catalog.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source)
     theirs = [
@@ -280,7 +280,7 @@ def test_no_robot_reports_gaps_of_another(gaps_home: Path) -> None:
 
 
 def test_texts_of_robots_are_shown_harmless(gaps_home: Path, tmp_path: Path) -> None:
-    """Names and causes with control characters and formulas, on a terminal and in a picture."""
+    """Names and causes with control characters and formulas, on a terminal and in an image."""
     rows = [
         {**mark(3600), 'topic': '/\x1b[31m$\\frac{$'},
         {**lost('9', 5, 6, cause='\x1b]0;x\x07$_$'), 'topic': '/\x1b[31m$\\frac{$'},
@@ -302,7 +302,7 @@ NUMBERS = st.none() | st.integers(-(1 << 63), MOST) | st.integers(NOON_NS, END_N
     'cause': st.none() | st.text(max_size=3), 'kind': st.none(), 'clock': st.none() | st.just('unset'),
 }), max_size=6))  # fmt: skip
 def test_hostile_rows_partition_time(given_: list[dict[str, Any]]) -> None:
-    """Any times and counts give stretches that fill the time, one after the other."""
+    """Any times and counts give consecutive periods that fill the time."""
     rows = [{**GAP_ROWS[0], **row, 'id': str(number)} for number, row in enumerate(given_)]
     found = of_rows('thor', 'objects', '/imu', NOON_NS, END_NS, rows)
     assert [each.begin_ns for each in found.stretches] == [NOON_NS, *(each.end_ns for each in found.stretches[:-1])]
@@ -311,7 +311,7 @@ def test_hostile_rows_partition_time(given_: list[dict[str, Any]]) -> None:
 
 
 def test_extremes_that_are_sane_are_answered(tmp_path: Path) -> None:
-    """Times at the ends of 64 bits, in a part that is otherwise sound."""
+    """Times at the limits of 64 bits, in an otherwise valid part."""
     rows = [
         {**mark(3600), 'from_ns': -MOST, 'to_ns': MOST},
         {**lost('9', 5, 6), 'from_ns': -MOST, 'to_ns': NOON_NS + 1, 'count': MOST},

@@ -1,4 +1,4 @@
-"""The gap journal in the store: the newest statement counts, in whatever order it arrives; and what is known about a time."""
+"""The gap journal in the store: the newest statement counts, in any order of arrival; and what is known about a time."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_without_a_watermark_gaps_are_unknown(store: StoreSettings) -> None:
 
 
 def test_by_received_a_gap_has_arrival_times(store: StoreSettings, tmp_path: Path) -> None:
-    """What has no time of arrival is untimed on that clock, and no watermark reaches into it."""
+    """A gap without a time of arrival is untimed on that clock, and no watermark extends into it."""
     late = {'received_from_ns': NOON_NS + 120 * SECOND, 'received_to_ns': NOON_NS + 123 * SECOND}
     whole = {'received_from_ns': NOON_NS + 100 * SECOND, 'received_to_ns': NOON_NS + 160 * SECOND}
     tell(store, tmp_path, mark(60, **whole), lost('1', 20, 23, **late), lost('2', 30, 31))
@@ -98,14 +98,14 @@ def test_with_received_only_accounts_gaps_are_unknown(store: StoreSettings, tmp_
 
 
 def test_messages_of_another_type_do_not_count(store: StoreSettings, tmp_path: Path) -> None:
-    """They are listed, and the time is whole."""
+    """They are listed, and the time is complete."""
     tell(store, tmp_path, mark(60), lost('1', 0, 60, kind='rejected', cause='wrong_type'))
     found = ask(store, 0, 60)
     assert (found.is_whole, len(found.gaps)) == (True, 1)
 
 
 def test_the_time_between_sessions_is_unknown_unless_reported(store: StoreSettings, tmp_path: Path) -> None:
-    """After a node was off, sequence numbers that continued show what was lost, as soon as they arrive."""
+    """After a node was off, consecutive sequence numbers show what was lost, as soon as they arrive."""
     tell(store, tmp_path, mark(60), mark(300, 2, 200, session=2))
     assert seconds(ask(store, 0, 300)) == [(0, 60, (), 'exact'), (60, 200, (), ''), (200, 300, (), 'exact')]
     tell(store, tmp_path, lost('2', 60, 200, 3, cause='restart', session=2), name='b')
@@ -113,7 +113,7 @@ def test_the_time_between_sessions_is_unknown_unless_reported(store: StoreSettin
 
 
 def test_a_watermark_goes_back_when_an_object_waits_again(store: StoreSettings, tmp_path: Path) -> None:
-    """The newest counts, not the furthest: a quarantined object that is retried is in no row, and not in the store yet."""
+    """The newest counts, not the latest time: a retried quarantined object is in no row, and not in the store yet."""
     tell(store, tmp_path, mark(3000), lost('1', 30, 31, kind='quarantined', cause='AccessDenied'))
     tell(store, tmp_path, mark(30, 2), lost('1', 30, 31, 2, WITHDRAWN), name='b')
     assert seconds(ask(store, 0, 60)) == [(0, 30, (), 'exact'), (30, 60, (), '')]
@@ -131,7 +131,7 @@ def test_a_gap_over_midnight_is_found_from_either_day(store: StoreSettings, tmp_
 
 
 def test_a_gap_that_moves_to_another_day_is_reported_once(store: StoreSettings, tmp_path: Path) -> None:
-    """Its withdrawal stays under the old date; who reads both days sees it once, who reads either sees what holds."""
+    """Its withdrawal stays under the old date; a query of both days returns it once, one of either day the valid one."""
     day_s = DAY_NS // SECOND
     tell(store, tmp_path, lost('1', 100, day_s + 100), mark(day_s + 200))
     tell(store, tmp_path, lost('1', 100, day_s + 100, 2, WITHDRAWN), lost('1', 100, 200, 2), name='b')
@@ -140,7 +140,7 @@ def test_a_gap_that_moves_to_another_day_is_reported_once(store: StoreSettings, 
 
 
 def test_a_part_read_for_one_time_is_not_read_again(store: StoreSettings, tmp_path: Path) -> None:
-    """``between`` answers as ``known`` would; what is outside is an error."""
+    """``between`` returns the same as ``known``; a time outside is an error."""
     tell(store, tmp_path, mark(60), *(lost(str(at), at, at + 0.5) for at in range(0, 60, 3)))
     found = ask(store, 0, 90)
     for first_s, last_s in ((0, 90), (3.2, 3.4), (3.5, 6), (59, 61), (70, 80), (5, 5)):
@@ -151,14 +151,14 @@ def test_a_part_read_for_one_time_is_not_read_again(store: StoreSettings, tmp_pa
 
 
 def test_the_newest_statement_of_a_gap_counts(store: StoreSettings, tmp_path: Path) -> None:
-    """In whatever file it is."""
+    """In any file."""
     for part in range(30):
         tell(store, tmp_path, *(lost(str(gap), gap, gap + 1, part + 1, count=part + 1) for gap in range(5)), name=f'{part:02}')
     assert gaps.newest(Bucket(store, BUCKET))['count'].to_pylist() == [30] * 5
 
 
 def test_an_invalid_time_range_is_refused(store: StoreSettings) -> None:
-    """It says what is wrong, and what is allowed."""
+    """The error gives the reason, and what is allowed."""
     with pytest.raises(SettingError, match='sink'):
         known('thor', '/imu', 0, 1, sink='tape', source=Bucket(store, BUCKET))
     with pytest.raises(SettingError, match='until'):
@@ -177,7 +177,7 @@ STATEMENTS = st.builds(
 @settings(max_examples=20, deadline=None)
 @given(st.lists(STATEMENTS, max_size=14), st.randoms(use_true_random=False))
 def test_the_order_of_statements_does_not_matter(rows: list[Statement], random: Any) -> None:
-    """Shuffled or repeated: what counts is the same."""
+    """Shuffled or repeated, the same ones count."""
     at_once = counting(rows)
     shuffled = [*rows, *rows[:3]]
     random.shuffle(shuffled)
@@ -205,7 +205,7 @@ def test_stretches_partition_time_and_match_the_rows(gaps: list[tuple[int, int, 
 
 
 def test_a_merged_day_gives_the_same_answers_and_keeps_withdrawals(store: StoreSettings, tmp_path: Path) -> None:
-    """A row file that comes late with an older statement changes nothing."""
+    """A row file that arrives late with an older statement changes nothing."""
     for number in range(20):
         rows = [lost('1', 5, 6, number), lost('2', 7, 8, number, GAP if number < 19 else WITHDRAWN), mark(number + 1, number)]
         tell(store, tmp_path, *rows, lost(f'x{number}', number, number + 0.5), name=f'p{number:02}')
@@ -217,7 +217,7 @@ def test_a_merged_day_gives_the_same_answers_and_keeps_withdrawals(store: StoreS
 
 
 def test_sql_sees_gaps_and_watermarks(store: StoreSettings, tmp_path: Path) -> None:
-    """Restricted by the flags; withdrawn gaps are not there; flags of objects are refused."""
+    """Restricted by the flags; withdrawn gaps are not included; flags of objects are refused."""
     tell(store, tmp_path, mark(60), lost('1', 5, 6), lost('2', 7, 8, 2, WITHDRAWN), lost('3', 9, 12, cause='restart', count=None))
     tell(store, tmp_path, lost('4', 7, 8, topic='/odom'), mark(90, topic='/odom'), name='b')
     source = Bucket(store, BUCKET)
@@ -246,7 +246,7 @@ def test_the_catalog_does_not_include_the_gap_journal(store: StoreSettings, tmp_
 
 
 def test_coverage_by_the_hour(store: StoreSettings, tmp_path: Path) -> None:
-    """Each second of an hour is stored, downsampled, lost by a cause, or not known yet."""
+    """Each second of an hour is stored, downsampled, lost by a cause, or unknown so far."""
     hour = 3600
     marks = [mark(60 * minute, minute, skipped=0 if minute <= 30 else minute) for minute in range(1, 91)]
     tell(store, tmp_path, *marks, lost('1', 600, 630), lost('2', 620, 640, cause='restart'))
@@ -263,7 +263,7 @@ def test_coverage_by_the_hour(store: StoreSettings, tmp_path: Path) -> None:
 
 
 def test_many_causes_are_summarized() -> None:
-    """What a part says is hostile: a list of all causes at each time would take hours, and all memory."""
+    """A part may be hostile: a list of all causes at each time would take hours, and all memory."""
     rows = [lost(f'{number}', number, 5000 - number, cause=f'cause-{number}') for number in range(1000)]
     found = of_rows('thor', 'objects', '/imu', NOON_NS, NOON_NS + 5000 * SECOND, rows)
     assert max(len(each.causes) for each in found.stretches) == MAX_CAUSES + 1
@@ -272,6 +272,6 @@ def test_many_causes_are_summarized() -> None:
 
 
 def test_a_stretch_has_a_state() -> None:
-    """Whole, open, or neither."""
+    """Complete, open, or neither."""
     kinds = [Stretch(0, 1, (), 'exact'), Stretch(0, 1, (), ''), Stretch(0, 1, ('restart',), ''), Stretch(0, 1, ('a',), 'exact')]
     assert [(each.is_whole, each.is_open) for each in kinds] == [(True, False), (False, True), (False, False), (False, False)]

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def tables(tmp_path: Path) -> Tables:
-    """Of a folder; empty."""
+    """Empty tables in a folder."""
     made = Tables(str(tmp_path / 'tables'))
     made.create()
     return made
@@ -71,7 +71,7 @@ def test_every_row_is_in_the_table_once(tmp_path: Path, tables: Tables) -> None:
 
 
 def test_a_row_in_two_files_is_added_once(tmp_path: Path, tables: Tables) -> None:
-    """A robot whose power failed repeats its last rows; reindex adds some that the robot delivers later."""
+    """A robot with a power failure repeats its last rows; reindex adds some that the robot delivers later."""
     rows = [row('camera', NOON_NS + second * SECOND) for second in range(4)]
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
         add_part(store, rows[:3], 'a', tmp_path / 'tmp')
@@ -94,7 +94,7 @@ def test_a_row_without_a_time_is_added_once(tmp_path: Path, tables: Tables) -> N
 
 
 def test_a_row_is_dated_by_its_own_time(tmp_path: Path, tables: Tables) -> None:
-    """Whatever folder its file is in: in the file of another date it is still the same row."""
+    """Whatever folder its file is in: in a file of another date it is still the same row."""
     midnight_ns = NOON_NS + 12 * 3600 * SECOND
     rows = [row('camera', midnight_ns + second * SECOND) for second in (-1, 0, 1)]
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
@@ -112,7 +112,7 @@ def summary_reads(source: Watched) -> list[str]:
 
 
 def test_how_a_mission_ended_is_in_the_tables_and_never_changes(tmp_path: Path) -> None:
-    """A query reads only the summaries of missions that had not ended; a robot that replaces its summary changes nothing."""
+    """A query reads only the summaries of missions that had not ended; a summary that a robot replaces changes nothing."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
     source = watched(settings)
@@ -147,7 +147,7 @@ def test_how_a_mission_ended_is_in_the_tables_and_never_changes(tmp_path: Path) 
 def test_a_kill_between_the_rows_and_the_record_of_their_file_repeats_nothing(
     tmp_path: Path, tables: Tables, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The next run reads the file again and adds nothing but the record."""
+    """The next run reads the file again and adds only its record."""
     rows = fill(folder_store(tmp_path), tmp_path / 'tmp', days=(0,))
     real = library._add
 
@@ -168,7 +168,7 @@ def test_a_kill_between_the_rows_and_the_record_of_their_file_repeats_nothing(
 
 
 def test_row_files_are_read_in_addition_to_the_tables(tmp_path: Path, tables: Tables) -> None:
-    """The rows that a version lacks: all of a new file, none of one whose rows were committed without their record."""
+    """Rows missing from the tables: all of a new file, none of one with rows that were committed without its record."""
     source = bucket(tmp_path)
     old = [row('camera', NOON_NS + second * SECOND) for second in range(3)]
     new = [row('odom', NOON_NS + second * SECOND) for second in range(3)]
@@ -184,7 +184,7 @@ def test_row_files_are_read_in_addition_to_the_tables(tmp_path: Path, tables: Ta
 
 
 def test_an_invalid_row_file_is_named_and_counted(tmp_path: Path, tables: Tables) -> None:
-    """It is read once; the rows of others count."""
+    """It is read once; the rows of other files count."""
     source, findings = bucket(tmp_path), Findings(lambda _: None)
     rows = [row('camera', NOON_NS)]
     with closing(open_store(source.settings, UploadSettings())) as store:
@@ -202,7 +202,7 @@ def test_an_invalid_row_file_is_named_and_counted(tmp_path: Path, tables: Tables
 
 
 def test_the_rows_of_a_newer_robot_are_added_without_the_columns_that_are_unknown(tmp_path: Path, tables: Tables) -> None:
-    """They are counted, no query takes them for rejected, and another robot's file is no part of the count."""
+    """They are counted, no query treats them as rejected, and the count excludes another robot's file."""
     source, findings = bucket(tmp_path), Findings(lambda _: None)
     rows = [row('camera', NOON_NS + second * SECOND) for second in range(3)]
     lines = ZstdDecompressor().decompress(parts.encode(rows)).splitlines(keepends=True)
@@ -233,7 +233,7 @@ for _ in range(10):
 
 
 def test_two_ingesters_and_a_compaction_at_a_time_add_every_row_once(tmp_path: Path, tables: Tables) -> None:
-    """Processes that start from the same versions again and again."""
+    """Processes that repeatedly start from the same versions."""
     source = bucket(tmp_path)
     rows: list[catalog.Row] = []
     with closing(open_store(source.settings, UploadSettings())) as store:
@@ -257,7 +257,7 @@ def test_two_ingesters_and_a_compaction_at_a_time_add_every_row_once(tmp_path: P
 
 
 def test_upkeep_makes_one_ordered_file_of_a_day_that_has_ended(tmp_path: Path, tables: Tables) -> None:
-    """And changes no row."""
+    """And it changes no row."""
     source = bucket(tmp_path)
     with closing(open_store(source.settings, UploadSettings())) as store:
         for number in (3, 1, 2):

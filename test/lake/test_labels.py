@@ -1,4 +1,4 @@
-"""Labels: layers in the store that are added and never changed, as filters and columns of every question."""
+"""Labels: layers in the store that are added and never changed, as filters and columns of every query."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def names(lake: Bucket) -> list[str]:
 
 
 def test_a_removal_is_a_layer_and_a_label_may_come_back(lake: Bucket, tmp_path: Path) -> None:
-    """The newest row about a label counts; layers stay, and say by whom and when."""
+    """The newest row about a label counts; layers stay, with author and time."""
     first = said(lake, STAIRS)
     said(lake, STAIRS)
     (one,) = labels.read(lake, 'thor')
@@ -67,7 +67,7 @@ def test_a_removal_is_a_layer_and_a_label_may_come_back(lake: Bucket, tmp_path: 
 
 
 def test_labels_choose_objects(lake: Bucket) -> None:
-    """A label of a time selects all that overlaps it, one of an object only that; with other flags, and as a view in SQL."""
+    """A label of a time selects everything that overlaps it, one of an object only that; with other flags, and in SQL."""
     said(lake, STAIRS)
     boxes = [BOX, replace(BOX, key='thor/camera/none.jpg')]
     kept, absent = labels.with_times(lake, boxes, Findings())
@@ -99,7 +99,7 @@ def test_samples_have_labels(lake: Bucket) -> None:
 
 
 def test_labels_are_read_from_csv_and_coco() -> None:
-    """A CSV and a COCO file; what is neither says why."""
+    """A CSV and a COCO file; another file gets an error with the reason."""
     head, first = b'label,since,until,key,x,y,width,height,note', b'stairs,2026-10-28T12:00,2026-10-28T12:01,,,,,,up'
     body = b'\n'.join((head, first, b'mug,,,thor/a.jpg,1,2,3,4,'))
     stairs, mug = labels.from_csv(body, 'thor', NOON_NS)

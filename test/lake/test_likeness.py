@@ -38,7 +38,7 @@ COLOURS = {'red': (250, 10, 20), 'green': (10, 240, 30), 'blue': (20, 10, 230), 
 
 
 class Lake:
-    """Images of one color each, half of them a day later, in a folder store."""
+    """Images of one color each, half of them a day later, in a directory store."""
 
     def __init__(self, home: Path, store: ObjectStore) -> None:
         self.home = home
@@ -81,7 +81,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_most_similar_come_first(lake: Lake, pair: Path) -> None:
-    """By a picture and by words, within what the flags choose."""
+    """By an image and by words, among those selected by the flags."""
     model = OnnxPair.open(pair)
     found = embed(lake.store, lake.source, model)
     assert (found.pictures, found.known, found.made, dict(found.refused)) == (4, 0, 4, {})
@@ -106,7 +106,7 @@ def test_images_with_a_vector_are_not_embedded_again(lake: Lake, pair: Path) -> 
 
 
 def test_each_model_has_separate_vectors(lake: Lake, pair: Path, tmp_path: Path) -> None:
-    """A model that was changed is another one, and none of its answers comes from vectors of the old one."""
+    """A changed model is another one, and its results never use vectors of the old one."""
     embed(lake.store, lake.source, OnnxPair.open(pair))
     changed = OnnxPair.open(make_pair(tmp_path / 'colours', scale=2.0))
     assert changed.digest != OnnxPair.open(pair).digest
@@ -203,7 +203,7 @@ def refer_outside(path: Path) -> None:
 
 
 def test_a_model_without_a_description_is_used(tmp_path: Path) -> None:
-    """SqueezeNet as the package onnx has it, without a document about pictures: its input says how large they are."""
+    """SqueezeNet as in the onnx package, without a document about images: its input determines their size."""
     shipped = Path(onnx.__file__).parent / 'backend' / 'test' / 'data' / 'light' / 'light_squeezenet.onnx'
     folder = tmp_path / 'squeezenet'
     folder.mkdir()
@@ -249,7 +249,7 @@ def test_images_with_the_same_content_are_all_found(lake: Lake, pair: Path) -> N
 
 
 def test_a_killed_run_loses_no_vector(lake: Lake, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was put by then is there, and the next run makes the rest."""
+    """Vectors stored by then are there, and the next run computes the rest."""
     monkeypatch.setattr(likeness, 'PART_ROWS', 1)
     model, put = OnnxPair.open(pair), likeness.put_part
     done: list[str] = []

@@ -1,4 +1,4 @@
-"""Names in a query that nothing has: which names are suggested instead."""
+"""Unknown names in a query, and the suggested ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KNOWN = ('objects', 'sensor', 'battery_pct', 't_start', 'x')
     ('sensor < <', 'syntax error near <', ''), ('1', 'sensr', ''), ('', '', ''),
 ])  # fmt: skip
 def test_a_misspelled_column_or_view_has_its_nearest_names(query: str, error: str, remedy: str) -> None:
-    """Whichever engine reports it: what counts is the name that both the query and the error have."""
+    """With any engine: the name in both the query and the error counts."""
     assert misspelled(query, error, KNOWN) == remedy
 
 

@@ -1,6 +1,6 @@
-"""Pruning deletes what rules name and nothing else, says so of each object, and may die anywhere.
+"""Pruning deletes only what rules select, records each deletion, and may be killed at any step.
 
-``lake prune`` against a real server: killed repeatedly, with concurrent readers, a compaction and another prune.
+``lake prune`` with a real server: killed repeatedly, with concurrent readers, a compaction and another prune.
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ if TYPE_CHECKING:
 NOW_NS = NOON_NS + 10 * DAY_NS
 RULES = 'camera 5d, bags 5d, events forever'
 AGES = range(10)
-"""The days before now that have rows."""
+"""The past days that have rows."""
 
 
 class Dead(Exception):
-    """The process died here."""
+    """The process was killed here."""
 
 
 class MortalStore:
-    """A store of a process that dies at the nth thing that it does."""
+    """A store whose process is killed at its nth operation."""
 
     def __init__(self, inner: Any, life: int) -> None:
         self._inner, self._life, self._lock = inner, life, threading.Lock()
@@ -85,7 +85,7 @@ def _source(settings: StoreSettings) -> Bucket:
 
 
 def _fill(settings: StoreSettings, folder: Path) -> None:
-    """Three objects of two sensors a day, with their content, at noon."""
+    """Three objects of two sensors per day, with their content, at noon."""
     with closing(open_store(settings, UploadSettings())) as store:
         for age in AGES:
             rows = [row(sensor, NOW_NS - age * DAY_NS + second * SECOND) for second in range(3) for sensor in ('camera', 'odom')]
@@ -133,7 +133,7 @@ def _answer(settings: StoreSettings) -> list[str]:
 
 
 def _check(settings: StoreSettings) -> None:
-    """The catalog names what the store has, and for every deleted object there is a row with the time of its deletion."""
+    """The catalog lists exactly the store's objects, and every deleted object has a row with the time of its deletion."""
     source, left_out = _source(settings), Findings()
     assert _answer(settings) == _stored(settings)
     rows = verify.rows(source, left_out)
@@ -156,7 +156,7 @@ def settings(filled: Path, tmp_path: Path) -> StoreSettings:
 
 
 def test_prune_deletes_exactly_what_a_rule_names(settings: StoreSettings) -> None:
-    """By sensor and age. The catalog names the rest, rows of deleted objects have the time, and a second run finds nothing."""
+    """By sensor and age. The catalog lists the rest, rows of deleted objects have the time, and a second run finds nothing."""
     before = _stored(settings)
     done = _run(settings)
     old = [key for key in before if '/camera/' in key and key.split('/')[2] < '20261102']
@@ -175,7 +175,7 @@ def test_prune_deletes_exactly_what_a_rule_names(settings: StoreSettings) -> Non
 
 
 def test_the_gap_journal_lists_deletions(settings: StoreSettings, tmp_path: Path) -> None:
-    """Of each hour one gap with its messages, which a later prune of more of that hour replaces."""
+    """For each hour one gap with its messages, which a later prune of more of that hour replaces."""
     began_ns = NOW_NS - 9 * DAY_NS
     with closing(open_store(settings, UploadSettings())) as store:
         said = complete('thor', 'j', 1, sink='objects', topic='/camera/compressed', session=1, from_ns=began_ns,
@@ -195,7 +195,7 @@ def test_the_gap_journal_lists_deletions(settings: StoreSettings, tmp_path: Path
 
 
 def test_referenced_objects_are_kept(settings: StoreSettings) -> None:
-    """A data set, a label of a time or of an object, and a request that is open, each counted and named; force overrides."""
+    """By a dataset, a label of a time or of an object, or an open request, each counted and named; force overrides."""
     source = _source(settings)
     exported, labeled, asked = (row('camera', NOW_NS - age * DAY_NS) for age in (9, 8, 7))
     at_ns = NOW_NS - 6 * DAY_NS
@@ -220,7 +220,7 @@ def test_referenced_objects_are_kept(settings: StoreSettings) -> None:
 
 
 def test_a_label_that_cannot_be_read_stops_it(settings: StoreSettings, tmp_path: Path) -> None:
-    """Then it is unknown what it refers to."""
+    """Otherwise labeled objects might be deleted."""
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/_labels/date=2026-11-01/thor_x.jsonl.zst', b'no parquet')
     with pytest.raises(LakeError, match='labels'):
@@ -257,7 +257,7 @@ def _repeat(settings: StoreSettings, folder: Path, of: catalog.Row, at_ns: int) 
 
 
 def test_a_repeat_keeps_what_holds_its_content(settings: StoreSettings, tmp_path: Path) -> None:
-    """An object that a younger row names as its content is as young as that row."""
+    """An object referenced as content by a younger row counts as young as that row."""
     held = row('camera', NOW_NS - 9 * DAY_NS)
     _repeat(settings, tmp_path / 'tmp', held, NOW_NS - DAY_NS + 30 * SECOND)
     _run(settings)
@@ -269,7 +269,7 @@ def test_a_repeat_keeps_what_holds_its_content(settings: StoreSettings, tmp_path
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('later_s', [600, 2 * 86_400 + 600])
 def test_a_label_of_a_repeat_protects_its_content(settings: StoreSettings, tmp_path: Path, later_s: int) -> None:
-    """On the same day and on another one; without it content and repeat go together, and the repeat's messages are counted."""
+    """On the same day and on another one; without it content and repeat are deleted together, and the repeat's messages count."""
     held = row('camera', NOW_NS - 9 * DAY_NS)
     again = _repeat(settings, tmp_path / 'tmp', held, held['t_start_ns'] + later_s * SECOND)
     at_ns = again['t_start_ns']
@@ -286,7 +286,7 @@ def test_a_label_of_a_repeat_protects_its_content(settings: StoreSettings, tmp_p
 
 
 def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp_path: Path) -> None:
-    """By a row with an older time, or by what looks like a part of what is forgotten: it may write below its own name alone."""
+    """With a row with an older time, or a fake deletion: a robot may only write below its prefix."""
     young = row('camera', NOW_NS)
     old_ns = NOW_NS - 9 * DAY_NS
     forged = {**row('camera', old_ns + MINUTE_NS), 'key': young['key']}
@@ -302,7 +302,7 @@ def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp
 
 
 def test_by_size_the_oldest_days_go(settings: StoreSettings) -> None:
-    """Only for rules with an age; a size that cannot be reached is reported."""
+    """Only for rules with an age; an unreachable size is reported."""
     per_day = sum(len(content(sensor, NOW_NS)) for sensor in ('camera', 'odom')) * 3
     camera = len(content('camera', NOW_NS)) * 3
     total = per_day * len(AGES)
@@ -318,7 +318,7 @@ def test_by_size_the_oldest_days_go(settings: StoreSettings) -> None:
 
 @pytest.mark.long('a death after each request')
 def test_prune_may_be_killed_anywhere(tmp_path: Path) -> None:
-    """After each step, whatever the catalog names exists; the next run finishes it, once for each object."""
+    """After each step, every object in the catalog exists; the next run finishes it, once for each object."""
     for life in range(100):
         settings = folder_store(tmp_path / str(life))
         with closing(open_store(settings, UploadSettings())) as store:
@@ -342,14 +342,14 @@ def test_prune_may_be_killed_anywhere(tmp_path: Path) -> None:
         if not is_dead:
             break
     else:
-        pytest.fail('it never came to its end')
+        pytest.fail('prune never finished')
     assert life > 6
     _check(settings)
 
 
 @pytest.mark.long('a second of CPU or more')
 def test_two_concurrent_prunes_delete_once(settings: StoreSettings) -> None:
-    """Both find the same; each object has one row that counts, and its messages are counted once."""
+    """Both find the same objects; each object has one row that counts, and its messages are counted once."""
     with closing(open_store(settings, UploadSettings())) as store:
         plans = [_plan(settings), _plan(settings, 'camera 7d')]
         failed: list[BaseException] = []
@@ -387,7 +387,7 @@ def test_merging_parts_does_not_change_the_result(settings: StoreSettings) -> No
 
 
 def test_missing_permission_names_the_required_user(settings: StoreSettings) -> None:
-    """And with that right the next run deletes what is written down."""
+    """And with that permission the next run deletes what is recorded."""
 
     class Denying(MortalStore):
         def delete(self, bucket: str, key: str) -> None:
@@ -412,7 +412,7 @@ def test_invalid_rules_are_rejected(text: str) -> None:
 
 
 def test_any_label_protects_what_it_reaches_into() -> None:
-    """As looking at each span does."""
+    """The same as checking each period."""
     rng = random.Random(7)
     for _ in range(300):
         spans = [(begin, begin + rng.randrange(30)) for begin in (rng.randrange(100) for _ in range(rng.randrange(8)))]
@@ -436,7 +436,7 @@ MAIN = (sys.executable, '-m', 'shadowhound_data_logger.cli.main')
 
 
 class Counting(Front):
-    """Passes on so many deletions and then answers nothing more."""
+    """Passes on this many deletions and then stops responding."""
 
     def __init__(self, url: str) -> None:
         super().__init__(url, lambda: Fault.HUNG if self.deleted >= self.limit else Fault.NONE)
@@ -465,7 +465,7 @@ def ended(processes: Sequence[subprocess.Popen[str]]) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.long('kills')
 def test_prune_may_be_killed_next_to_readers_and_a_compaction(seaweed: Tower, tmp_path: Path) -> None:
-    """In the end exactly what the rule names is deleted, with one row each; concurrent readers can read all the rest."""
+    """In the end exactly what the rule selects is deleted, with one row each; concurrent readers can read the rest."""
     now_ns, chance = time.time_ns(), random.Random(7)
     ages = range(10)
     rows: dict[str, catalog.Row] = {}

@@ -1,6 +1,6 @@
-"""A researcher asks a robot for what it keeps, and gets it: a spool, a folder as the store, and the command line between them.
+"""A researcher requests kept data from a robot, and gets it: a spool, a directory store, and the command line between them.
 
-What a robot answers to a request, and labels below a robot's own prefix: anything may be in them.
+A robot's responses to a request, and labels below a robot's prefix: they may contain anything.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Field:
         self.passes()
 
     def passes(self) -> None:
-        """Ten seconds: the robot polls its mailbox, reports what it has, and delivers."""
+        """Ten seconds: the robot polls its mailbox, reports its data, and delivers."""
         self.now_s += 10
         self.clock.now_ns += 10 * SECOND
         self.server.step()
@@ -103,7 +103,7 @@ class Field:
             self.server.step()
 
     def kept(self, **want: Any) -> list[int]:
-        """The numbers of what the store says that the robot keeps."""
+        """The numbers of the objects that the robot keeps, according to the store."""
         found = lake.kept(self.source, 'thor', KeptFilter(**want), Findings())
         return sorted(int(key[-16:-10]) for key in found['key'].to_pylist())
 
@@ -118,7 +118,7 @@ def field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Field]:
 
 
 def run(*arguments: str, code: int = 0) -> Any:
-    """A verb's JSON."""
+    """The JSON output of a command."""
     done = CliRunner().invoke(cli, [*arguments, '--json'], standalone_mode=False)
     assert done.exception is None, done.exception
     assert done.return_value == code, done.output
@@ -145,7 +145,7 @@ def test_a_pull_delivers_the_requested_objects(field: Field) -> None:
 
 @pytest.mark.parametrize('seed', range(4))
 def test_thinned_objects_have_their_current_size(tmp_path: Path, seed: int) -> None:
-    """The robot reports it again, with fewer bytes, and in any order that row counts; of what is lost the row that says so."""
+    """The robot reports it again, with fewer bytes, and that row counts in any order; for lost messages the row of the loss."""
     found = [('a', 'robot', 100), ('a', 'robot', 50), ('b', 'robot', 10), ('a', 'robot', 80), ('b', 'lost', 10)]
     random.Random(seed).shuffle(found)
     settings = folder_store(tmp_path)
@@ -159,7 +159,7 @@ def test_thinned_objects_have_their_current_size(tmp_path: Path, seed: int) -> N
 
 
 def test_waiting_ends_with_the_last_answer(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also of a request that another one made; a new one prunes it."""
+    """Also for a request of another client; a new one removes it."""
     field.records(1, 2)
     monkeypatch.setattr(lake.time, 'sleep', lambda _: field.passes())
     first = run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:02Z', '--wait')
@@ -170,7 +170,7 @@ def test_waiting_ends_with_the_last_answer(field: Field, monkeypatch: pytest.Mon
 
 
 def test_objects_lost_on_the_robot_are_reported(field: Field) -> None:
-    """The row of a loss supersedes that of what was kept, before and after a merge, and so does that of an arrival."""
+    """The row of a loss supersedes that of the kept object, before and after a merge, and so does that of an arrival."""
     field.records(*range(8), size=200 << 10)
     assert field.kept() == [3, 4, 5, 6, 7]
     said = run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:04Z')
@@ -188,7 +188,7 @@ def test_objects_lost_on_the_robot_are_reported(field: Field) -> None:
 
 
 def test_a_request_is_cancelled(field: Field) -> None:
-    """The robot answers that it was, and what it has not sent stays."""
+    """The robot confirms it, and what it has not sent stays."""
     field.records(1)
     request = run('pull', '--sensor', 'camera')['id']
     done = CliRunner().invoke(cli, ['pull', '--cancel', request], standalone_mode=False)
@@ -246,7 +246,7 @@ def test_unavailable_data_is_reported(field: Field, arguments: tuple[str, ...]) 
     (['--sensor', 'thermal', '--until', '2025-10-18'], '', ''), (['--bag', 'patrl_*'], '', ''),
 ])  # fmt: skip
 def test_a_name_that_nothing_has_is_wrong_usage(field: Field, arguments: list[str], what: str, remedy: str) -> None:
-    """The nearest names are suggested; what the robot keeps and the catalog does not know exists as well."""
+    """The nearest names are suggested; data that the robot keeps and the catalog does not list exists as well."""
     field.records(1)
     item = make('thor/thermal/20251018/000000_x.jpg', t_start_ns=NOON_NS, t_end_ns=NOON_NS, sensor='thermal', topic='/thermal',
                 metadata={meta.ROBOT: 'thor', meta.SHIP: meta.ON_REQUEST, meta.MISSION_TYPE: 'patrol'})  # fmt: skip
@@ -266,7 +266,7 @@ def test_a_name_that_nothing_has_is_wrong_usage(field: Field, arguments: list[st
 
 @pytest.mark.long('a picture by matplotlib')
 def test_throughput_predicts_the_duration_of_a_pull(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The median of what the robot measured lately; the same by place is a picture."""
+    """The median of the robot's recent measurements; the same by position is an image."""
     field.records(1, 2)
     samples = [
         {'stamp_ns': NOON_NS, 'x': float(number), 'y': 0.0, 'mbps': mbps} for number, mbps in enumerate((0.0, 1.0, 2.0, 9.0))
@@ -286,7 +286,7 @@ def test_throughput_predicts_the_duration_of_a_pull(field: Field, tmp_path: Path
 
 
 def test_a_dataset_pulls_kept_data(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It waits until the objects and their rows have arrived; others are kept. A folder has no robot to request from."""
+    """It waits until the objects and their rows have arrived; others are kept. A folder has no robot to send requests to."""
     field.records(*range(6))
     monkeypatch.setattr(lake.time, 'sleep', lambda _: field.passes())
     assert len(MissionDataset(field.source, since=NOON)) == 0
@@ -302,7 +302,7 @@ def test_a_dataset_pulls_kept_data(field: Field, tmp_path: Path, monkeypatch: py
 
 
 def test_an_unfinished_pull_is_reported(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With how far it came."""
+    """With its progress."""
     field.records(1)
     field.server._release = lambda _: False  # type: ignore[method-assign] # it has no link
 
@@ -317,7 +317,7 @@ def test_an_unfinished_pull_is_reported(field: Field, monkeypatch: pytest.Monkey
 
 
 def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:
-    """For a requester: foreign entries of the mailbox are skipped, and no number or text in an answer crashes a command."""
+    """On the client: foreign entries of the mailbox are skipped, and no number or text in a response crashes a command."""
     field.records(1, 2)
     prefix = '_requests/thor/inbox.json'
     lake.make(field.store, 'thor')
@@ -366,7 +366,7 @@ REQUEST = PullRequest(
 
 @pytest.fixture(scope='module')
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store with the data of a day, and a request in the mailbox of its robot."""
+    """A store with a day of data, and a request in the mailbox of its robot."""
     root = tmp_path_factory.mktemp('hostile-answers')
     fill(folder_store(root), root, days=(0,))
     inbox = root / 'store/sensor-data/_requests/thor/inbox.json'
@@ -376,14 +376,14 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def is_harmless(text: str) -> bool:
-    """No character has power over a terminal; one without a meaning in Unicode has none."""
+    """No character controls a terminal, and none is unassigned in Unicode."""
     return all(unicodedata.category(each) not in UNSEEN or each == '\n' for each in text)
 
 
 @settings(max_examples=40, deadline=None)
 @given(answer=ANSWERS, is_addressed=st.booleans())
 def test_any_answer_is_listed(home: Path, answer: dict[str, Any], is_addressed: bool) -> None:
-    """As text and as JSON; the request is there either way, and no control character reaches the terminal."""
+    """As text and as JSON; the request is there in any case, and no control character reaches the terminal."""
     place = home / 'store/sensor-data/thor/_answers' / REQUEST.id / '1.json'
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_text(json.dumps({**answer, 'id': REQUEST.id, 'state': str(answer.get('state'))} if is_addressed else answer))
@@ -398,7 +398,7 @@ def test_any_answer_is_listed(home: Path, answer: dict[str, Any], is_addressed: 
 
 
 def row(**fields: Any) -> dict[str, Any]:
-    """Of a label that is fine."""
+    """The row of a valid label."""
     one = labels.Label(robot='thor', label='stairs', since_ns=LAKE_NOON_NS, until_ns=LAKE_NOON_NS + SECOND).checked()
     return {**{name: getattr(one, name) for name in labels.FIELDS}, 'what': 'label', 'by': 'ann', 'made_ns': LAKE_NOON_NS,
             'made': LAKE_NOON_NS // 1000, 'format_version': 1, **fields}  # fmt: skip
@@ -428,7 +428,7 @@ HOSTILE: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize('kind', HOSTILE)
 def test_hostile_labels_affect_no_other_robot(tmp_path: Path, kind: str) -> None:
-    """The label beside it is shown, and every verb that reads labels answers without a control character."""
+    """The label next to it is shown, and every command that reads labels responds without a control character."""
     fill(folder_store(tmp_path), tmp_path, days=(0,), hours=(12,))
     source = Bucket(folder_store(tmp_path), 'sensor-data')
     bad_parts.put(folder_store(tmp_path), parts.encode([row()], LABELS), 'thor_good', of=LABELS)

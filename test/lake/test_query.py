@@ -69,7 +69,7 @@ def found(source: Any, **flags: Any) -> list[str]:
 def test_flags_select_rows(
     world: tuple[StoreSettings, list[catalog.Row]], flags: dict[str, Any], holds: Callable[[catalog.Row], bool]
 ) -> None:
-    """The answer is what a loop over all rows finds."""
+    """The result equals that of a loop over all rows."""
     settings, rows = world
     expected = keys([row for row in rows if holds(row)])
     assert found(Bucket(settings, catalog.BUCKET), **flags) == expected
@@ -85,7 +85,7 @@ def test_flags_select_rows(
     ],
 )  # fmt: skip
 def test_objects_near_a_place_on_earth_are_found(tmp_path: Path, near: Any, numbers: list[int]) -> None:
-    """Around a town, across the antimeridian and around the pole; what has no place is nowhere."""
+    """Around a town, across the antimeridian and around the pole; objects without a position are never found."""
     places = ['48.1351 11.582 500', '48.1352 11.582 500', '48.1361 11.582 500', '0 179.9995 0', '0 -179.9995 nan', '89.9995 0 0',
               '89.9995 180 0', None]  # fmt: skip
     settings = folder_store(tmp_path)
@@ -97,7 +97,7 @@ def test_objects_near_a_place_on_earth_are_found(tmp_path: Path, near: Any, numb
 
 @pytest.mark.parametrize('near', ['1,2', '91,0,5', '0,181,5', '0,0,0', '0,0,nan', 'a,b,c', (0.0, 0.0)])
 def test_an_invalid_place_is_refused(world: tuple[StoreSettings, list[catalog.Row]], near: Any) -> None:
-    """It is refused, with what would be one."""
+    """With a valid example."""
     with pytest.raises(SettingError, match='near_gps'):
         found(Bucket(world[0], catalog.BUCKET), near_gps=near)
 
@@ -136,7 +136,7 @@ def test_every_column_round_trips(world: tuple[StoreSettings, list[catalog.Row]]
 
 
 def test_only_requested_days_are_read(tmp_path: Path) -> None:
-    """Of other days not even the names; what is in the tables is not read again."""
+    """Not even the names of other days; what is in the tables is not read again."""
     fill(folder_store(tmp_path), tmp_path / 'tmp')
     source = watched(folder_store(tmp_path))
     assert len(lake.objects(source, robot='thor', **DAY)) == 192
@@ -150,7 +150,7 @@ def test_only_requested_days_are_read(tmp_path: Path) -> None:
 
 
 def test_rows_of_a_store_that_was_replaced_are_forgotten(tmp_path: Path) -> None:
-    """A folder, or the address of a server, that now holds something else."""
+    """A folder, or the address of a server, with different contents now."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,))
     assert len(found(Bucket(settings, catalog.BUCKET))) == 192
@@ -160,7 +160,7 @@ def test_rows_of_a_store_that_was_replaced_are_forgotten(tmp_path: Path) -> None
 
 
 def test_sql_over_the_views_is_consistent(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
-    """``objects``, ``topics`` and ``missions`` agree with one another, within the flags."""
+    """``objects``, ``topics`` and ``missions`` agree with one another, with the same flags."""
     source = Bucket(world[0], catalog.BUCKET)
     day = [row for row in world[1] if catalog.date_of(row) == '2026-10-28']
     counted = lake.sql('SELECT sensor, count(*) AS n FROM objects GROUP BY sensor ORDER BY sensor', source, **DAY).to_pydict()
@@ -191,7 +191,7 @@ def test_an_invalid_summary_affects_only_its_mission(tmp_path: Path, told: str) 
 
 
 def test_a_file_deleted_during_a_listing_is_not_an_error(tmp_path: Path) -> None:
-    """As those do that a compacted one stands for."""
+    """A compacted file replaces them."""
     settings = folder_store(tmp_path)
     rows = fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
     gone = settings.directory / catalog.BUCKET / 'thor/_catalog/date=2026-10-28/gone.parquet'
@@ -215,7 +215,7 @@ def test_a_mission_without_a_summary_has_no_end(tmp_path: Path) -> None:
 
 
 def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> None:
-    """The mission names it, and the manifest of that very hash names the data set; one with another hash is not believed."""
+    """The mission names it, and the manifest with that hash names the dataset; one with another hash is ignored."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
     packed, manifest = Spark(tmp_path / 'spark').packed(7)
@@ -236,7 +236,7 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
         assert found(source, policy=wanted) == expected, wanted
     assert found(source, policy='go2_patrol', success=False) == own
     others = 'go2_patrol@7#0000000000000000, none, go2_stairs@3#1111111111111111'
-    told = {'policy': 'go2_patrol@7#0000000000000000', 'policies': others}  # it changed in the middle
+    told = {'policy': 'go2_patrol@7#0000000000000000', 'policies': others}  # it changed during the mission
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/missions/run-both/summary.json', json.dumps(told).encode())
         both = {**row('camera', NOON_NS + 10**9), 'mission_id': 'mlast', 'run_id': 'run-both'}
@@ -249,7 +249,7 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
 
 
 def test_objects_delivered_before_their_run_existed_belong_to_the_mission(tmp_path: Path) -> None:
-    """How the mission ended, and its run, are known from others of its objects, which the question need not ask for."""
+    """The mission's outcome and its run are known from its other objects, which the query need not select."""
     settings = folder_store(tmp_path)
     rows = [each for _, few in minutes(days=(0,), hours=(11,)) for each in few]
     early = [{**each, 'run_id': None} if each['sensor'] == 'camera' else each for each in rows]
@@ -277,7 +277,7 @@ def test_objects_delivered_before_their_run_existed_belong_to_the_mission(tmp_pa
 def test_every_invalid_query_is_the_same_kind_of_error(
     world: tuple[StoreSettings, list[catalog.Row]], ask: Callable[[Any], object]
 ) -> None:
-    """A LakeError that says what the engine could not make sense of."""
+    """A LakeError with the part that the engine rejected."""
     with pytest.raises(LakeError, match='cannot be answered'):
         ask(Bucket(world[0], catalog.BUCKET))
 
@@ -291,7 +291,7 @@ def test_a_missing_lake_is_empty(tmp_path: Path) -> None:
 
 
 class Recorder(Front):
-    """A front that notes the target of each request."""
+    """A proxy that records the target of each request."""
 
     targets: list[str]
 
@@ -307,7 +307,7 @@ def through(front: Front, tower: Tower) -> StoreSettings:
 
 @pytest.mark.seaweedfs
 def test_only_that_day_is_read_from_a_real_server(seaweed: Tower, tmp_path: Path) -> None:
-    """What goes over the wire names no other day; the answer is that of the folder; no secret shows anywhere."""
+    """The requests name no other day; the result is the same as for the folder; no secret is shown."""
     fill(seaweed.store_settings(), tmp_path)
     rows = [row for _, each in minutes() for row in each]
     with Recorder(seaweed.endpoint_url) as front:
@@ -331,7 +331,7 @@ def test_only_that_day_is_read_from_a_real_server(seaweed: Tower, tmp_path: Path
 
 @pytest.mark.seaweedfs
 def test_wrong_credentials_are_reported_without_showing_them(seaweed: Tower) -> None:
-    """The error is ours and has neither key nor secret."""
+    """It is a LakeError without key and secret."""
     plain = seaweed.store_settings()
     wrong = StoreSettings(endpoint_url=plain.endpoint_url, access_key_id=plain.access_key_id, secret_access_key='not the secret')
     with pytest.raises(CredentialsRejected) as caught:
@@ -359,6 +359,6 @@ def test_missing_credentials_are_reported(
 
 
 def test_a_source_can_be_sent_to_another_process(world: tuple[StoreSettings, list[catalog.Row]]) -> None:
-    """As Ray does it."""
+    """As with Ray."""
     source = pickle.loads(pickle.dumps(Bucket(world[0], catalog.BUCKET)))  # noqa: S301 - our own
     assert len(found(source, **DAY)) == len(world[1]) // 2

@@ -54,7 +54,7 @@ def answer(settings: StoreSettings, **flags: Any) -> list[str]:
 
 
 def test_a_lost_catalog_is_rebuilt(settings: StoreSettings) -> None:
-    """All rows, with what the robot would have written; a second run adds nothing."""
+    """All rows, as the robot would have written them; a second run adds nothing."""
     found = run(settings)
     assert (found.listed, found.added, found.gone) == (9, 9, 0)
     assert answer(settings) == ALL
@@ -67,7 +67,7 @@ def test_a_lost_catalog_is_rebuilt(settings: StoreSettings) -> None:
 
 
 def test_only_missing_rows_are_requested(settings: StoreSettings, tmp_path: Path) -> None:
-    """What the robot's parts have is listed and nothing more; what they name that is gone is counted, and stays."""
+    """Objects in the robot's parts are only listed; missing objects named there are counted, and their rows stay."""
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [row('odom', stamp_ns) for stamp_ns in (*TIMES[:3], NOON_NS + 5 * SECOND)], 'part', tmp_path / 'tmp')
     found = run(settings)
@@ -89,7 +89,7 @@ def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, t
 
 
 def test_a_killed_reindex_resumes(settings: StoreSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parts of what was asked so far are there; the next run asks for the rest."""
+    """Parts of the objects requested so far are there; the next run requests the rest."""
     monkeypatch.setattr(library, 'PAGE', 4)
     asked: list[str] = []
     plain = library.Bucket

@@ -1,4 +1,4 @@
-"""Words: the index is made of the store alone, answers the best first, and obeys nothing that is written in a query."""
+"""Full-text search: the index is built from the store alone, returns the best results first, and executes nothing in a query."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def missions(index: Path, text: str, **flags: object) -> list[str | None]:
 
 
 def test_words_phrases_and_prefixes_are_found(index: Path) -> None:
-    """All words in any order, those of a phrase in its own; letters in any form; the best first."""
+    """All words in any order, those of a phrase in order; letters in any form; the best first."""
     assert sorted(map(str, missions(index, 'door handle'))) == ['m0', 'm1']
     assert missions(index, '"door handle"') == ['m0']
     without = search.search(index, 'DOOR -kitchen', wanted(0), kind='mission')
@@ -78,7 +78,7 @@ def test_words_phrases_and_prefixes_are_found(index: Path) -> None:
 
 
 def test_flags_restrict_the_search(index: Path) -> None:
-    """Robot, time, mission, how it ended, label and ranges."""
+    """Robot, time, mission, outcome, label and ranges."""
     assert missions(index, 'door handle', success=False) == ['m1']
     assert missions(index, 'door handle', until='2026-10-28T12:30') == ['m0']
     assert missions(index, 'door handle', mission='run1') == ['m1']
@@ -115,7 +115,7 @@ def test_an_update_reads_what_is_new(lake: Bucket, index: Path, tmp_path: Path) 
 
 
 def test_the_index_is_shared_through_the_store(lake: Bucket, index: Path) -> None:
-    """It takes the place of the one before."""
+    """It replaces the previous one."""
     with closing(open_store(lake.settings, UploadSettings())) as store:
         search.put(store, 'sensor-data', '_search/search.db', index)
         with closing(sqlite3.connect(index)) as db:
@@ -128,7 +128,7 @@ def test_the_index_is_shared_through_the_store(lake: Bucket, index: Path) -> Non
 
 @given(st.text(max_size=40) | st.text('"*-()ORNEAD:^+ {}a\'', max_size=20))
 def test_a_query_is_not_a_command(index: Path, text: str) -> None:
-    """Whatever is typed is searched for, or refused with what is allowed: it is never a syntax error of SQLite's."""
+    """Any input is searched for, or refused with what is allowed: it is never a syntax error of SQLite."""
     with suppress(SettingError):
         search.search(index, text, wanted(0))
 
@@ -183,12 +183,12 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
      ('küche*', 'de0'), ('kuchentur', 'de0'), ('Küchentür', 'de0'), ('tür', ''), ('부엌*', 'ko0'), ('부엌', '')],
 )  # fmt: skip
 def test_words_of_scripts_without_spaces_are_found(commands: Path, query: str, expected: str) -> None:
-    """They are found wherever they are, one letter is enough; of compounds with letters the beginning is (decision 0023)."""
+    """Anywhere, even a single letter; for compounds with letters only at the start (decision 0023)."""
     assert sorted(map(str, missions(commands, query))) == expected.split()
 
 
 def test_excerpts_are_verbatim(commands: Path) -> None:
-    """Nothing of how the index is made can be seen in an answer."""
+    """They show nothing of the tokenization."""
     for query in ('厨房', 'ドア', 'ประตู', 'küche*'):
         (found,) = search.search(commands, query, wanted(0))
         assert found['title'] == COMMANDS[str(found['mission_id'])]
@@ -196,7 +196,7 @@ def test_excerpts_are_verbatim(commands: Path) -> None:
 
 
 def test_labels_of_scripts_without_spaces_are_compared_whole(tmp_path: Path) -> None:
-    """The flag compares whole names, and names come back unchanged."""
+    """The flag compares complete names, and names are returned unchanged."""
     settings = folder_store(tmp_path)
     with closing(open_store(settings, UploadSettings())) as store:
         told = {'mission_id': 'm', 'mission_command': '厨房', 'start_ns': NOON_NS, 'end_ns': NOON_NS + SECOND}
@@ -221,7 +221,7 @@ def test_the_index_takes_little_more_than_the_words(tmp_path: Path) -> None:
 
 
 def test_an_index_of_another_version_is_built_again(lake: Bucket, tmp_path: Path) -> None:
-    """By the next update, from the store; until then a search does not use it: it has other words."""
+    """By the next update, from the store; until then a search ignores it, since its tokens differ."""
     path = tmp_path / 'search.db'
     search.update(path, lake)
     with closing(sqlite3.connect(path)) as db, db:

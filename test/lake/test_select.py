@@ -1,4 +1,4 @@
-"""A question in words becomes times, a circle, and the dates whose parts can hold the answer."""
+"""A query's arguments become times, a circle, and the dates of the parts to read."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ MIDNIGHT_NS = NOON_NS - DAY_NS // 2
 
 @pytest.mark.parametrize('near', ['1,2', '1,2,0', '1,2,-3', 'a,b,c', '1,2,nan', '1,2,3,4'])
 def test_an_invalid_circle_is_refused(near: str) -> None:
-    """A radius is positive and all three are numbers."""
+    """A radius must be positive and all three must be numbers."""
     with pytest.raises(SettingError, match='near'):
         wanted(NOON_NS, near=near)
 
 
 @given(st.integers(0, 40 * DAY_NS), st.integers(1, 40 * DAY_NS), st.integers(0, 80 * DAY_NS))
 def test_dates_cover_the_range_exactly(since: int, span: int, at: int) -> None:
-    """A moment is wanted only if its date is among them; the first and the last date hold one."""
+    """A time is selected only if its date is included; the first and the last date contain a selected time."""
     asked = Wanted(since_ns=MIDNIGHT_NS + since, until_ns=MIDNIGHT_NS + since + span)
     dates = asked.dates(NOON_NS)
     assert dates is not None
@@ -49,7 +49,7 @@ def test_nothing_is_between_an_end_and_a_later_beginning() -> None:
 
 
 def test_a_long_time_is_looked_up_instead() -> None:
-    """Years of folders are not asked for one by one; neither is all that is before an end."""
+    """Years of folders are not requested one by one; nor is everything before an end."""
     assert Wanted(since_ns=0, until_ns=NOON_NS).dates(NOON_NS) is None
     assert Wanted(until_ns=NOON_NS).dates(NOON_NS) is None
     assert not Wanted(until_ns=MIDNIGHT_NS).has_date('2026-10-28')
@@ -57,6 +57,6 @@ def test_a_long_time_is_looked_up_instead() -> None:
 
 
 def test_rows_without_a_date_are_selected_only_without_times() -> None:
-    """Objects of a boot whose clock was never set are of no day."""
+    """Objects of a boot with a clock that was never set belong to no day."""
     assert Wanted().has_date(UNDATED)
     assert not Wanted(until_ns=NOON_NS).has_date(UNDATED)

@@ -1,4 +1,4 @@
-"""A search server has each row, gap, mission, event and label once, whatever happens on the way. It is an in-memory stand-in."""
+"""A search server has each row, gap, mission, event and label once, whatever fails in between. The server is a fake in memory."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SUMMARY = {
 }  # fmt: skip
 LABEL = labels.Label(robot='thor', label='stairs', since_ns=NOON_NS, until_ns=NOON_NS + SECOND)
 COUNTS = {'objects': 96, 'gaps': 3, 'missions': 3, 'events': 2, 'labels': 1}
-"""What is in the lake below."""
+"""The contents of the lake below."""
 
 
 @pytest.fixture(scope='module')
@@ -95,7 +95,7 @@ def counts(url: str) -> dict[str, int]:
 
 def send(url: str, settings: StoreSettings, home: Path, *, tries: float = 3, findings: Findings | None = None,
          server: type[sink.SearchServer] = sink.SearchServer) -> sink.SinkTally:  # fmt: skip
-    """A run as ``lake sink`` makes it, without its pauses."""
+    """A run of ``lake sink``, without its pauses."""
     found = Findings(lambda _: None) if findings is None else findings
     with closing(server(url)) as opened, sink.opened(opened, 'robots', home) as position:
         return sink.Sink(Bucket(settings, 'sensor-data'), opened, 'robots', position, found, tries, pause=lambda _: None).send()
@@ -134,7 +134,7 @@ def test_a_document_has_the_documented_fields(url: str, settings: StoreSettings,
 
 
 def test_the_newest_statement_stays(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """Of a gap and of a label, in whatever order they are sent."""
+    """For a gap and a label, sent in any order."""
     send(url, settings, tmp_path)
     gap_parts.tell(settings, tmp_path, gap_parts.lost('a', 1, 2, revision=3, what=WITHDRAWN), name='c')
     gap_parts.tell(settings, tmp_path, gap_parts.lost('a', 1, 2, revision=2, count=9), name='b')
@@ -189,19 +189,19 @@ def test_pruned_objects_are_marked(url: str, settings: StoreSettings, tmp_path: 
 
 
 def fill_row() -> catalog.Row:
-    """One of the lake's, a frame."""
+    """A row of the lake, a frame."""
     _, rows = next(minutes(days=(0,), hours=(11,)))
     return rows[0]
 
 
 class Death(BaseException):
-    """The process is gone."""
+    """The process was killed."""
 
 
 def test_a_sink_may_be_killed_anywhere(
     url: str, settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before or after any request, again and again: in the end each document is there, and once."""
+    """Before or after any request, repeatedly: in the end each document is there, once."""
     monkeypatch.setattr(sink, 'BULK_DOCUMENTS', 7)
     monkeypatch.setattr(sink, 'MISSIONS_AT_A_TIME', 2)
     requests = [0]
@@ -238,7 +238,7 @@ Answer = Callable[[int, bytes], 'tuple[int, bytes] | None']
 
 @contextmanager
 def between(url: str, answer: Answer) -> Iterator[tuple[str, list[Any]]]:
-    """A server before another one: ``answer`` gets the number and body of each bulk request; None hands it on."""
+    """A proxy for a server: ``answer`` gets the number and body of each bulk request; None forwards it."""
     seen: list[Any] = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -291,7 +291,7 @@ def test_transient_errors_are_retried(url: str, settings: StoreSettings, tmp_pat
 
 
 def test_an_unreachable_server_ends_the_run(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """The error has a remedy, and what the server accepted before is recorded."""
+    """The error has a remedy, and documents accepted before it are recorded."""
     with between(url, lambda number, _: (429, b'{}') if number > 1 else None) as (proxy, _):
         with pytest.raises(SinkUnavailable, match='is overloaded or unavailable'):
             send(proxy, settings, tmp_path)
@@ -299,7 +299,7 @@ def test_an_unreachable_server_ends_the_run(url: str, settings: StoreSettings, t
 
 
 def test_rejected_documents_are_counted_and_the_others_sent(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """One that has to wait is sent again alone; one that is refused is counted by reason and listed, and the others continue."""
+    """A deferred one is retried alone; a refused one is counted by reason and listed, and the others continue."""
     sizes: list[int] = []
 
     def answer(number: int, body: bytes) -> tuple[int, bytes] | None:
@@ -327,7 +327,7 @@ def test_rejected_documents_are_counted_and_the_others_sent(url: str, settings: 
 
 
 def documented(headers: dict[str, str], body: bytes) -> None:
-    """A bulk request as both servers describe it: action and document in turn, a line each, the last one ended as well."""
+    """A bulk request as both servers document it: alternating actions and documents, one per line, all lines ended."""
     assert headers['Content-Type'] == 'application/x-ndjson'
     assert body.endswith(b'\n')
     lines = body.decode('ascii').splitlines()
@@ -361,7 +361,7 @@ def test_an_invalid_answer_is_an_error(url: str, settings: StoreSettings, tmp_pa
 
 
 def test_an_invalid_part_is_reported_each_time(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """And keeps nothing else back."""
+    """And does not block others."""
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path, 'thor/_catalog/date=2026-10-28/thor_x.jsonl.zst', b'it is not')
     for _ in range(2):
@@ -405,7 +405,7 @@ FOLDER = Path(__file__).parents[2] / 'docs' / 'elastic'
 
 
 def fields(value: Any) -> Iterator[str]:
-    """All that saved objects name as a field of a document."""
+    """All names of document fields in the saved objects."""
     if isinstance(value, dict):
         for name, inner in value.items():
             if name in {'field', 'timeFieldName'}:
@@ -423,7 +423,7 @@ def fields(value: Any) -> Iterator[str]:
 
 @pytest.mark.parametrize('kind', sink.INDEXES)
 def test_the_dashboards_use_existing_fields(kind: str) -> None:
-    """As far as parsing shows: each reference leads to an object of the file, each field exists in documents."""
+    """As far as parsing shows: each reference is to an object of the file, each field exists in documents."""
     objects = [json.loads(line) for line in (FOLDER / f'{kind}.ndjson').read_text().splitlines()]
     there = {(each['type'], each['id']) for each in objects}
     assert {(one['type'], one['id']) for each in objects for one in each['references']} <= there
@@ -450,7 +450,7 @@ def test_the_command_reports_rejected_documents(url: str, settings: StoreSetting
 
 @pytest.mark.long('processes that are killed')
 def test_a_killed_run_resumes(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """The command, killed at its first, second, ... request; then it ends, and everything is there once."""
+    """The command, killed at its first, second, ... request; then it finishes, and everything is there once."""
     assert settings.directory is not None
     home = tmp_path / 'home'
     home.mkdir()
@@ -484,7 +484,7 @@ RUN = 'from shadowhound_data_logger.cli.main import main; main()'
 
 @pytest.mark.parametrize('number', [0, 1, 1 << 40, (1 << 62) - 1, 1 << 62, (1 << 63) - 1, -1, -(1 << 63)])
 def test_no_version_is_larger_than_a_server_reads(number: int) -> None:
-    """One row of a hostile robot would have the server refuse the documents of all others in the same request."""
+    """Because of one row of a hostile robot the server would refuse all documents in the same request."""
     earlier, later = sink._version(number, is_later=False), sink._version(number, is_later=True)
     assert 0 <= earlier < later < 1 << 63
     assert number < 0 or number >= 1 << 62 or earlier == 2 * number

@@ -1,4 +1,4 @@
-"""Other engines open the tables of the lake: the unchanged lines of docs/api/lake.md, on a real S3 server."""
+"""Other engines read the tables of the lake: the unchanged lines of docs/api/lake.md, with a real S3 server."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ print(json.dumps({sensor: int(count) for sensor, count in rows}))
 
 @pytest.fixture(scope='module')
 def lake(tower: Tower, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, str]]:
-    """The address and the options of a table with ``COUNTS``."""
+    """The URL and the options of a table with ``COUNTS``."""
     settings, folder, robot = tower.store_settings(), tmp_path_factory.mktemp('engines'), 'engines'
     keys = {'aws_access_key_id': settings.access_key_id, 'aws_secret_access_key': settings.secret_access_key}
     with closing(boto3.client('s3', endpoint_url=settings.endpoint_url, region_name=settings.region, **keys)) as client:
@@ -71,7 +71,7 @@ def lake(tower: Tower, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, d
 
 
 def examples() -> dict[str, str]:
-    """By the name of the module that is imported."""
+    """By the name of the imported module."""
     blocks = re.split(r'^    # (.*)$', PAGE.read_text(encoding='utf-8'), flags=re.MULTILINE)[1:]
     found = {}
     for title, block in zip(blocks[::2], blocks[1::2], strict=True):
@@ -82,7 +82,7 @@ def examples() -> dict[str, str]:
 
 
 def test_the_page_has_all_engines() -> None:
-    """And no other, which nothing would run."""
+    """And no others, which would not be tested."""
     assert set(examples()) == {'duckdb', 'polars', 'pandas', 'daft', 'ray', 'spark'}
 
 

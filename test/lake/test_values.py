@@ -1,4 +1,4 @@
-"""Conditions on the numbers in the objects: held against a loop over all messages, whatever the numbers are."""
+"""Conditions on the numbers in the objects: compared with a loop over all messages, for any numbers."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from shadowhound_data_logger.stores import open_store
 
 SIGNS = {'<': operator.lt, '<=': operator.le, '>': operator.gt, '>=': operator.ge, '=': operator.eq, '!=': operator.ne}
 NUMBERS = st.sampled_from([0.0, -1.0, 2.5, 7.038531e-26, 1e308, -1e308, math.inf, -math.inf, math.nan, 15.0, 0.1])
-"""Few, so that they meet the thresholds often."""
+"""Few, so that they often equal the thresholds."""
 MESSAGES = st.lists(
     st.fixed_dictionaries({}, optional={'a': NUMBERS, 'n': st.fixed_dictionaries({'b': NUMBERS}),
                                         'l': st.lists(NUMBERS, max_size=3), 'w': st.lists(NUMBERS, min_size=21, max_size=22)}),
     min_size=1, max_size=5,
 )  # fmt: skip
-"""A batch: fields that are missing in some, nested ones, lists of changing length, and long ones."""
+"""A batch: fields that some messages lack, nested ones, lists of changing length, and long ones."""
 FIELDS = st.sampled_from(['a', 'n.b', 'n', 'l', 'l.1', 'w', 'z'])
 LEAVES = st.builds(
     '{0}s.{1}{2} {3} {4}'.format,
@@ -82,7 +82,7 @@ def filled(root: Path, batches: list[list[dict[str, Any]]], told: list[bool], ch
 
 
 def numbers(value: Any, path: list[str]) -> list[float]:
-    """What a path means in a message: all finite numbers below it; in long lists the elements have no separate numbers."""
+    """The meaning of a path in a message: all finite numbers below it; in long lists elements have no separate numbers."""
     if isinstance(value, dict):
         below = [value[path[0]]] if path and path[0] in value else [] if path else list(value.values())
         return [number for each in below for number in numbers(each, path[1:])]
@@ -95,7 +95,7 @@ def numbers(value: Any, path: list[str]) -> list[float]:
 
 
 def fields(messages: list[dict[str, Any]], path: str) -> dict[str, list[float | None]]:
-    """By the name of each field that a path means, its numbers in the order of the messages; None for those not finite."""
+    """The numbers of each field that a path selects, in message order; None for those not finite."""
     found: dict[str, list[float | None]] = {}
 
     def walk(name: str, value: Any) -> None:
@@ -114,7 +114,7 @@ def fields(messages: list[dict[str, Any]], path: str) -> dict[str, list[float | 
 
 
 def met(text: str, messages: list[dict[str, Any]]) -> list[bool]:
-    """Of each message, by taking the condition apart at its outermost word."""
+    """For each message, by splitting the condition at its outermost operator."""
     if text.startswith('('):
         depth = next(at for at in range(1, len(text)) if text[: at + 1].count('(') == text[: at + 1].count(')'))
         word, right = text[depth + 1 :].strip().split(' ', 1)
@@ -138,7 +138,7 @@ def met(text: str, messages: list[dict[str, Any]]) -> list[bool]:
 
 
 def expected(text: str, batches: list[list[dict[str, Any]]]) -> list[tuple[int, int, int]]:
-    """Runs of messages that meet the condition: first and last stamp, and how many they are."""
+    """Runs of messages that meet the condition: first and last stamp, and their number."""
     runs = []
     for number, messages in enumerate(batches):
         begin_ns = NOON_NS + number * 60 * SECOND
@@ -166,7 +166,7 @@ examples = [0]
 def test_the_answer_is_what_a_loop_over_all_messages_finds(
     folder: Path, batches: list[list[dict[str, Any]]], conditions: list[str], data: st.DataObject
 ) -> None:
-    """With statistics of all objects, of some, or of fields that were chosen; before files of tables are merged and after it."""
+    """With statistics of all objects, of some, or of selected fields; before files of tables are merged and after it."""
     told = data.draw(st.lists(st.booleans(), min_size=len(batches), max_size=len(batches)))
     examples[0] += 1
     root = folder / str(examples[0])
@@ -185,7 +185,7 @@ BATCHES = [[{'a': 1.0 * number + place} for place in range(5)] for number in ran
 
 
 def test_only_objects_that_may_match_are_opened(tmp_path: Path) -> None:
-    """A batch whose messages all, or none, meet the condition is not opened; for a statistic, none is."""
+    """A batch is not opened if all or none of its messages meet the condition; for a statistic, none is."""
     source = filled(tmp_path, BATCHES, [True] * 10)
     found = values.ranges('s.a > 11', source)
     assert (found.objects, found.opened, found.unknown) == (10, 2, 0)
@@ -197,7 +197,7 @@ def test_only_objects_that_may_match_are_opened(tmp_path: Path) -> None:
 
 
 def test_objects_without_statistics_are_unknown_until_scanned(tmp_path: Path) -> None:
-    """An answer says how many objects it does not know; with ``scan`` they are opened."""
+    """A result has the number of unknown objects; with ``scan`` they are opened."""
     source = filled(tmp_path, BATCHES, [True] * 5 + [False] * 5)
     found = values.ranges('s.a > 11', source)
     assert (len(found.ranges), found.opened, found.unknown) == (0, 0, 5)
@@ -206,7 +206,7 @@ def test_objects_without_statistics_are_unknown_until_scanned(tmp_path: Path) ->
 
 
 def test_the_ranges_of_an_answer_choose_objects(tmp_path: Path) -> None:
-    """An object counts where it reaches into one of them, and an answer within them is cut to them."""
+    """An object counts if it overlaps one of them, and a result within them is clipped to them."""
     source = filled(tmp_path, BATCHES, [True] * 10)
     found = values.ranges('s.a > 11', source)
     chosen = [{'robot': each.robot, 'since_ns': each.since_ns, 'until_ns': each.until_ns} for each in found.ranges]
@@ -257,7 +257,7 @@ LIES: list[dict[str, Any]] = [
 
 
 def test_inconsistent_statistics_are_reported(tmp_path: Path) -> None:
-    """Their object is as one without statistics, never one without the field, and the others are evaluated as usual."""
+    """Their object counts as one without statistics, never as one without the field, and the others are evaluated as usual."""
     source = filled(tmp_path, [BATCHES[-1]] * (len(LIES) + 3), [True] * (len(LIES) + 3))
     first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))
     second.unlink()
@@ -273,7 +273,7 @@ def test_inconsistent_statistics_are_reported(tmp_path: Path) -> None:
 
 
 def test_absurd_counts_of_messages_hide_nothing(tmp_path: Path) -> None:
-    """Objects whose own row cannot be true are unknown, or opened where those of their fields give a reason to."""
+    """Objects with an impossible row are unknown, or are opened if the rows of their fields give a reason to."""
     source = filled(tmp_path, [BATCHES[-1]] * 5, [True] * 5)
     first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))
     second.unlink()
@@ -341,7 +341,7 @@ def slow(root: Path, stamps_s: list[float], values_: list[float]) -> Bucket:
 
 @pytest.mark.parametrize('period_s', [1.0, 5.0])
 def test_jittered_samples_of_a_slow_sensor_are_one_range(tmp_path: Path, period_s: float) -> None:
-    """The sensor's own period says what belongs together; a real pause still parts two ranges, and --join is obeyed."""
+    """The sensor's period determines what is joined; a real pause still separates two ranges, and --join is respected."""
     stamps = [period_s * (place + 0.35 * math.sin(7 * place) + (60 if place >= 50 else 0)) for place in range(100)]
     lake = slow(tmp_path, stamps, [20.0] * 100)
     found = values.ranges('s.a > 15', lake, scan=True)

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.seaweedfs
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Tower]:
-    """With a reader who may not write."""
+    """With a reader without write permission."""
     with Tower(tmp_path / 'tower', users={'spark': ('Read', 'List')}) as started:
         yield started
 
@@ -55,7 +55,7 @@ def found(source: Bucket, **flags: object) -> list[str]:
 
 
 def test_before_during_and_after_ingestion_a_reader_sees_each_row_once(server: Tower, tmp_path: Path) -> None:
-    """Without the bucket from its own tables; then from row files; then from both; then from the tables alone."""
+    """From its tables without the bucket; then from row files; then from both; then from the tables alone."""
     rows = fill(server.store_settings(), tmp_path / 'tmp')
     reader, owner = of(server, 'spark'), of(server, 'tower')
     assert not Tables.for_ingest(owner).is_shared
@@ -79,14 +79,14 @@ def test_before_during_and_after_ingestion_a_reader_sees_each_row_once(server: T
 
 
 def test_a_query_as_of_a_time_sees_what_the_tables_had_then(server: Tower, tmp_path: Path) -> None:
-    """Not what was ingested later, and nothing of row files."""
+    """Not rows ingested later, and none of row files."""
     rows = fill(server.store_settings(), tmp_path / 'tmp', days=(0,))
     with_bucket(server)
     owner = of(server, 'tower')
     tables = Tables.for_ingest(owner)
     ingest(owner, tables, Findings())
     then = datetime.now(timezone.utc)
-    while datetime.now(timezone.utc) < then.replace(microsecond=0) + timedelta(seconds=1):  # what SeaweedFS dates commits by
+    while datetime.now(timezone.utc) < then.replace(microsecond=0) + timedelta(seconds=1):  # the dates of commits in SeaweedFS
         time.sleep(0.05)
     more = [row('odom', NOON_NS + 3 * SECOND + number) for number in range(2)]
     with closing(open_store(server.store_settings(), UploadSettings())) as store:
@@ -101,7 +101,7 @@ def test_a_query_as_of_a_time_sees_what_the_tables_had_then(server: Tower, tmp_p
 
 
 def test_an_object_is_deleted_after_the_tables_name_it_as_deleted(server: Tower, tmp_path: Path) -> None:
-    """A reader of the tables alone, such as DuckDB, expects no object that is gone; row files about deleted objects are kept."""
+    """A reader of the tables alone, such as DuckDB, expects no missing object; row files about deleted objects are kept."""
     rows = fill(server.store_settings(), tmp_path / 'tmp', days=(0,), hours=(11,))
     with_bucket(server)
     owner = of(server, 'tower')
@@ -130,7 +130,7 @@ def test_an_object_is_deleted_after_the_tables_name_it_as_deleted(server: Tower,
 
 
 def test_vacuum_keeps_what_a_query_as_of_a_time_within_the_last_month_needs(tmp_path: Path) -> None:
-    """Files that were merged are not deleted before."""
+    """Merged files are not deleted before that."""
     source = Bucket(folder_store(tmp_path), catalog.BUCKET)
     fill(source.settings, tmp_path / 'tmp', days=(0,))
     lake.objects(source)

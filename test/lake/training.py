@@ -1,4 +1,4 @@
-"""A robot's drive for the data sets' tests: every object is made by the node's own encoders, and the truth is a formula."""
+"""A robot's drive for the tests of datasets: objects are made by the node's encoders, the expected values by a formula."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ ODOMETRY, JOINTS, LOWSTATE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/JointStat
 IMU_HZ: Final = 20
 JOINTS_HZ: Final = 5
 FRAMES_HZ: Final = 4
-"""Of archives; single frames are 1 Hz."""
+"""Of archives; single frames are at 1 Hz."""
 _PREFIX: Final = TemporaryDirectory()
 LATE_NS: Final = 30_000_000
-"""Odometry is so much later than the frame of its second."""
+"""The delay of odometry after the frame of its second."""
 
 
 def pixels(number: int) -> Any:
-    """The picture of a frame before it is a JPEG: no two are alike."""
+    """The pixels of a frame before JPEG compression: no two are alike."""
     rows = np.arange(24, dtype=np.uint8)[:, None, None] * 4
     return np.broadcast_to(rows + np.array([number * 7 % 150, 60, number % 13], np.uint8), (24, 32, 3)).copy()
 
@@ -57,7 +57,7 @@ def imu_reading(stamp_ns: int) -> list[float]:
 
 @lru_cache
 def _ros() -> Ros:
-    """One for all: it reads the definitions of the messages from a prefix that lasts as long as the process."""
+    """One for all: it reads the message definitions from a prefix that exists as long as the process."""
     share = Path(_PREFIX.name) / 'share' / 'go2_interfaces'
     share.mkdir(parents=True)
     (share / 'msg').symlink_to(GO2_MESSAGES, target_is_directory=True)
@@ -65,7 +65,7 @@ def _ros() -> Ros:
 
 
 class Drive:
-    """Encodes what the robot published in a time, and puts it where it belongs."""
+    """Encodes the messages published in a period, and stores the objects."""
 
     def __init__(self, settings: StoreSettings, tmp: Path, robot: str = 'thor') -> None:
         self.settings, self.robot = settings, robot
@@ -73,7 +73,7 @@ class Drive:
         self._folder = tmp / 'bodies'
         self.rows: list[catalog.Row] = []
         self.late_ns: dict[str, int] = {}
-        """Sensor -> how much later than their stamps its messages arrive."""
+        """Sensor -> delay of its messages after their stamps."""
         self.has_arrivals = True
 
     def record(self, seconds: int, *, frames: str = 'jpeg', without: Sequence[str] = (), first: int = 0) -> None:

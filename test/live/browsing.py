@@ -1,4 +1,4 @@
-"""The live page in Chromium, over a server in this process: to open it, to press its buttons, and what it must hold."""
+"""The live page in Chromium, with a server in this process: opening it, pressing its buttons, and waiting for its contents."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FLAGS = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox
 
 
 def opened(browser: Browser, url: str) -> Page:
-    """A tab that remembers what it asked for (``asked``) and what went wrong in it (``wrong``)."""
+    """A tab that records its requests (``asked``) and its errors (``wrong``)."""
     page: Any = browser.new_page(viewport={'width': 1280, 'height': 800})
     page.set_default_timeout(120_000)
     page.wrong = []
@@ -52,17 +52,17 @@ def opened(browser: Browser, url: str) -> Page:
 
 
 def press(button: Locator) -> None:
-    """Without waiting for frames, of which a software GL on a busy machine draws few."""
+    """Click without waiting for frames: a software GL on a busy machine draws few."""
     button.dispatch_event('click')
 
 
 def holds(page: Page, script: str) -> None:
-    """Wait until it is so in the page, which lets nobody else evaluate text (``script-src 'self'``)."""
+    """Wait until the expression is true in the page, which does not allow evaluating text (``script-src 'self'``)."""
     until(lambda: page.evaluate(script), script)
 
 
 def wider(page: Page, width: int) -> list[Any]:
-    """What reaches beyond the right edge of a screen that is so wide, once the page is laid out for it."""
+    """Everything that extends beyond the right edge of a screen with this width, once the page is laid out for it."""
     page.set_viewport_size({'width': width, 'height': 850})
     holds(page, f'innerWidth === {width} && document.querySelector("main").clientWidth <= {width}')
     page.evaluate('new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))')
@@ -93,7 +93,7 @@ NAMES = (HOSTILE, LONG)
 
 
 class Served:
-    """A live page in this process, on a thread of its own, until it is closed."""
+    """A live page in this process, on a separate thread, until it is closed."""
 
     def __init__(self, settings: LiveSettings, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(server_module, 'find_spec', lambda _: None)  # no ROS here
@@ -107,7 +107,7 @@ class Served:
         asyncio.run_coroutine_threadsafe(doing, self.loop).result(120)
 
     def every(self, seconds: float, made: Callable[[], list[LiveItem]]) -> Callable[[], object]:
-        """Show what is made then as what came from the robot; what ends it."""
+        """Repeatedly show what ``make`` returns as data from the robot; returns a function that stops it."""
 
         async def show() -> None:
             while True:
@@ -124,7 +124,7 @@ class Served:
 
 
 def told_of_names(now_ms: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Figures and gaps in which every text is hostile or long."""
+    """Values and gaps in which every text is hostile or long."""
     counts = dict.fromkeys(('received', 'stored', 'skipped', 'missed', 'pending', 'lost'), 1_234_567_890)
     topics = [
         {'topic': f'/{name}', 'type': f'a/msg/{name}', 'sensor': name, 'missed_estimated': None, 'unavailable': name,
@@ -147,7 +147,7 @@ def told_of_names(now_ms: float) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def literals(folder: str, error: str, keyword: str = '') -> set[str]:
-    """The words by which that part of the package raises an error."""
+    """The string literals with which that part of the package raises an error."""
     found: set[str] = set()
     for path in (Path(shadowhound_data_logger.__file__).parent / folder).rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -162,7 +162,7 @@ CAUSES = [
     SAMPLER_FAILED, ENCODER_FAILED, UNWRITABLE, RING_FULL, RETENTION, 'shutdown', 'stopped', 'foreign', 'access_denied',
     'refused', *literals('encode', 'Rejected'), *literals('stores', 'ObjectRefused', 'reason'),
 ]  # fmt: skip
-"""Why messages are not in the store, as far as the code knows it; a server may have a word of its own."""
+"""The causes of missing messages that the code knows; a server may have others."""
 IMU = 'sensor_msgs/msg/Imu'
 
 
@@ -171,10 +171,10 @@ def counted(page: Page, kind: str) -> int:
 
 
 def rgb(color: str) -> list[int]:
-    """Of a computed color."""
+    """A computed color as RGB."""
     return [int(part) for part in re.findall(r'\d+', color)[:3]]
 
 
 def most_of(found: list[float]) -> float:
-    """19 of 20 are no larger: now and then two busy cores let a page wait."""
+    """19 of 20 are no larger: occasionally a busy machine makes a page wait."""
     return sorted(found)[len(found) * 19 // 20]

@@ -1,4 +1,4 @@
-"""The Chromium in which the tests of the live page open it."""
+"""The Chromium with which the tests open the live page."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from shadowhound_data_logger.live.access import LASTS_S, MAX_FAILURES, SIGN_OUTS
 
 
 class Door:
-    """Tokens, and a clock of ours: who tries which token when."""
+    """Tokens, and a clock set by the test."""
 
     def __init__(self, folder: Path) -> None:
         self.paths = access_module.make_tokens(folder)
@@ -21,7 +21,7 @@ class Door:
         self.access = access_module.Access(self.paths, is_open=False, monotonic=lambda: self.now_s)
 
     def guess(self, address: str) -> bool:
-        """Whether the address may try at all; its token is wrong."""
+        """Whether the address may try at all, with a wrong token."""
         if self.access.wait_s(address):
             return False
         assert self.access.sign_in('a wrong token', address) is None
@@ -33,7 +33,7 @@ class Door:
 
 
 def test_strangers_lock_out_only_themselves(tmp_path: Path) -> None:
-    """Wrong tokens of many addresses, one a second and for an hour, do not keep the operator from signing in."""
+    """Wrong tokens from many addresses, one per second and for an hour, do not keep the operator from signing in."""
     door = Door(tmp_path)
     for second in range(3600):
         door.now_s += 1.0
@@ -42,7 +42,7 @@ def test_strangers_lock_out_only_themselves(tmp_path: Path) -> None:
 
 
 def test_an_address_that_guesses_waits_a_minute_from_its_first_guess(tmp_path: Path) -> None:
-    """It may try as often as is allowed in any minute; the wait is said, and a right token after it clears the record."""
+    """It may try up to the limit in any minute; the wait is reported, and a valid token after it clears the record."""
     door = Door(tmp_path)
     assert [door.guess('10.0.0.1') for _ in range(MAX_FAILURES + 1)] == [True] * MAX_FAILURES + [False]
     assert door.access.wait_s('10.0.0.1') == access_module.FAILURES_S
@@ -52,7 +52,7 @@ def test_an_address_that_guesses_waits_a_minute_from_its_first_guess(tmp_path: P
 
 
 def test_a_host_with_many_addresses_of_ipv6_is_one(tmp_path: Path) -> None:
-    """All addresses of a /64 wait together, an IPv4 address is the same within IPv6, and other networks do not wait."""
+    """All addresses of a /64 wait together, an IPv4 address is the same when mapped to IPv6, and other networks do not wait."""
     door = Door(tmp_path)
     assert [door.guess(f'fd00::{n:x}') for n in range(MAX_FAILURES + 1)] == [True] * MAX_FAILURES + [False]
     assert door.lets_in('fd00:0:0:1::1')
@@ -61,7 +61,7 @@ def test_a_host_with_many_addresses_of_ipv6_is_one(tmp_path: Path) -> None:
 
 
 def test_the_memory_of_wrong_tokens_is_bounded(tmp_path: Path) -> None:
-    """However many addresses guess, a bounded number of them is remembered, and those that guess now are among them."""
+    """However many addresses guess, a bounded number of them is remembered, including those that guess now."""
     door = Door(tmp_path)
     for number in range(3 * access_module.MAX_ADDRESSES):
         door.guess(f'10.{number >> 16 & 255}.{number >> 8 & 255}.{number & 255}')
@@ -74,7 +74,7 @@ def test_the_memory_of_wrong_tokens_is_bounded(tmp_path: Path) -> None:
     ('mode', 'text', 'why'), [(0o640, 'a' * 30, 'restricted to its owner'), (0o600, 'short', 'no token of at least')]
 )
 def test_a_token_that_others_can_read_is_refused(tmp_path: Path, mode: int, text: str, why: str) -> None:
-    """The start says which file and what to do."""
+    """The error names the file and the remedy."""
     paths = make_tokens(tmp_path)
     assert {stat.S_IMODE(path.stat().st_mode) for path in paths.values()} == {0o600}
     paths['viewer'].write_text(text)
@@ -84,7 +84,7 @@ def test_a_token_that_others_can_read_is_refused(tmp_path: Path, mode: int, text
 
 
 def test_a_forged_cookie_is_rejected(tmp_path: Path) -> None:
-    """Another role, a later end, or nothing that is a cookie: nobody."""
+    """With another role, a later end, or invalid contents it identifies no user."""
     now = [1000.0]
     access = Access(make_tokens(tmp_path), is_open=False, now=lambda: now[0])
     signed = access.sign_in((tmp_path / 'viewer.token').read_text().strip(), '10.0.0.1')
@@ -101,7 +101,7 @@ def test_a_forged_cookie_is_rejected(tmp_path: Path) -> None:
 
 
 class Signing:
-    """Sign-ins at a time that the test owns; each ``Access`` is another process with the same tokens."""
+    """Sign-ins with a clock set by the test; each ``Access`` acts as another process with the same tokens."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -124,12 +124,12 @@ class Signing:
 
     @property
     def entries(self) -> int:
-        """Of the file, each of which has a line; the first two are none."""
+        """The entries of the file, one per line; the first two lines are not entries."""
         return len((self.folder / f'viewer.{SIGN_OUTS_FILE}').read_text().splitlines()) - 2
 
 
 def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> None:
-    """Two of them run: neither forgets what the other one was told, not even at the same moment."""
+    """With two processes neither forgets the other's sign-outs, even simultaneous ones."""
     it = Signing(tmp_path)
     first, second = it.access(), it.access()
     cookies = [it.cookie(first) for _ in range(6)]
@@ -147,7 +147,7 @@ def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> N
 
 
 def test_the_memory_of_sign_outs_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beyond the most there may be the oldest leave, and nobody of theirs comes back; what has expired leaves by itself."""
+    """Above the limit the oldest are removed, and none of those cookies becomes valid again; expired entries are removed."""
     monkeypatch.setattr(access_module, 'MAX_SIGN_OUTS', 3)
     it = Signing(tmp_path)
     access = it.access()
@@ -165,12 +165,12 @@ def test_the_memory_of_sign_outs_is_bounded(tmp_path: Path, monkeypatch: pytest.
     last = it.cookie(access)
     it.sign_out(access, last)
     assert it.entries == 1
-    it.now[0] -= LASTS_S  # the clock of a robot is set back: what has expired had not
+    it.now[0] -= LASTS_S  # the robot's clock is set back: the expired entry is valid again
     assert [cookie for cookie in (*ended, last) if it.access().who(cookie) is not None] == []
 
 
 def test_repeated_sign_outs_of_a_viewer_end_no_operators_sign_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is remembered beyond the most there may be counts for the role alone."""
+    """Sign-outs above the limit count for the role alone."""
     monkeypatch.setattr(access_module, 'MAX_SIGN_OUTS', 3)
     it = Signing(tmp_path)
     access = it.access()
@@ -184,7 +184,7 @@ def test_repeated_sign_outs_of_a_viewer_end_no_operators_sign_in(tmp_path: Path,
 
 
 def test_repeated_sign_ins_of_a_viewer_end_no_operators_sign_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of his own sign-ins the last one is left, also when all came within a second."""
+    """Only the newest of the viewer's sign-ins is valid, also if all were within a second."""
     monkeypatch.setattr(access_module, 'MAX_SIGN_OUTS', 3)
     it = Signing(tmp_path)
     access = it.access()
@@ -204,7 +204,7 @@ def test_repeated_sign_ins_of_a_viewer_end_no_operators_sign_in(tmp_path: Path, 
 
 
 def test_a_clock_that_was_ahead_makes_no_cookie_for_years(tmp_path: Path) -> None:
-    """Damage that is found then ends all sign-ins until then; it is said what to do, and new tokens are a way out."""
+    """The damage found then ends all sign-ins until that time; the remedy is reported, and new tokens help."""
     it = Signing(tmp_path)
     it.now[0] += 70 * 365 * 86400.0
     (tmp_path / f'viewer.{SIGN_OUTS_FILE}').write_bytes(b'damaged')
@@ -226,7 +226,7 @@ def test_a_clock_that_was_ahead_makes_no_cookie_for_years(tmp_path: Path) -> Non
 def test_a_damaged_file_ends_sign_ins_but_allows_new_ones(
     tmp_path: Path, damage: Callable[[bytes], bytes], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It could have named anybody: all sign in again, at once and with the same tokens, and the log says why, once."""
+    """It could have named any user: all must sign in again, immediately, with the same tokens; the log has the reason once."""
     it = Signing(tmp_path)
     access = it.access()
     ended, living = it.cookie(access), it.cookie(access)
@@ -234,7 +234,7 @@ def test_a_damaged_file_ends_sign_ins_but_allows_new_ones(
     path = tmp_path / f'viewer.{SIGN_OUTS_FILE}'
     path.write_bytes(damage(path.read_bytes()))
     after = it.access()
-    again = it.cookie(after)  # the very first request, within the same second
+    again = it.cookie(after)  # the first request, within the same second
     for each in (after, it.access()):
         assert [each.who(cookie) is not None for cookie in (ended, living, again)] == [False, False, True]
     assert [record.levelname for record in caplog.records] == ['WARNING']
@@ -242,7 +242,7 @@ def test_a_damaged_file_ends_sign_ins_but_allows_new_ones(
 
 
 def test_a_sign_in_continues_while_its_token_is_valid(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The other role's file may be read by others: it lets nobody in, which the log says once."""
+    """If other users can read the other role's file, its token is invalid, which is logged once."""
     it = Signing(tmp_path)
     access = it.access()
     viewer = it.cookie(access)

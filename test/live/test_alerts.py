@@ -1,4 +1,4 @@
-"""Alerts: which conditions they are about, and that each is sent once, to a real HTTP server."""
+"""Alerts: their conditions, and that each is sent once, to a real HTTP server."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NOW_S = 1_800_000_000.0
 
 
 class Webhook:
-    """An HTTP server that remembers what it was sent, and answers with ``status``."""
+    """An HTTP server that records requests, and responds with ``status``."""
 
     def __init__(self) -> None:
         self.status = 200
@@ -74,7 +74,7 @@ async def webhook() -> AsyncIterator[tuple[Webhook, str]]:
 
 
 class Checked:
-    """Alerts about conditions that a test chooses, at a time that it chooses."""
+    """Alerts for conditions and times set by a test."""
 
     def __init__(self, url: str, folder: Path) -> None:
         self.now_s, self.found = NOW_S, [Condition('thor', 'disk', False, 'the disk is full')]
@@ -122,7 +122,7 @@ def test_a_condition_is_reported_once_when_it_begins_and_once_when_it_ends(tmp_p
 
 
 def test_a_condition_that_comes_and_goes_is_reported_once_an_hour(tmp_path: Path) -> None:
-    """And then if it still is one; other conditions of the robot are reported meanwhile."""
+    """And then if it still holds; other conditions of the robot are reported during that time."""
 
     async def run() -> None:
         async with webhook() as (hook, url):
@@ -147,7 +147,7 @@ def test_a_condition_that_comes_and_goes_is_reported_once_an_hour(tmp_path: Path
 def test_what_could_not_be_sent_is_sent_after_the_next_check(
     status: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """No redirect is followed. The log has the reason once, and no part of the URL beyond the host."""
+    """No redirect is followed. The log has the reason once, and no part of the URL after the host."""
 
     async def run() -> None:
         async with webhook() as (hook, url):
@@ -168,7 +168,7 @@ def test_what_could_not_be_sent_is_sent_after_the_next_check(
 def test_a_server_that_does_not_answer_delays_nothing(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An attempt ends after a time limit; so does one to a port that nobody listens on."""
+    """An attempt ends after a time limit; so does one to a port without a listener."""
     monkeypatch.setattr(module, 'TIMEOUT_S', 0.2)
 
     async def run() -> None:
@@ -216,7 +216,7 @@ def test_a_damaged_state_file_sends_again(tmp_path: Path) -> None:
 
 
 def test_the_page_of_a_store_detects_the_conditions_of_its_robots(tmp_path: Path) -> None:
-    """Silence, losses above a bound, objects that were deleted or are in quarantine; of a retired robot silence is unknown."""
+    """Silence, losses above a limit, deleted or quarantined objects; for a retired robot silence is not a condition."""
     store_of(tmp_path, NOON_NS)
     tell(
         folder_store(tmp_path), tmp_path, lost('1', 3, 4, cause='transport', topic='/imu', count=7),
@@ -270,7 +270,7 @@ def test_the_page_of_a_robot_detects_its_conditions(tmp_path: Path) -> None:
 
 
 def test_the_page_of_a_store_sends_alerts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """About robots that are silent, without a viewer."""
+    """About silent robots, without a viewer."""
     store_of(tmp_path, time.time_ns() - 7200 * SECOND)
 
     async def run() -> None:
@@ -286,7 +286,7 @@ def test_the_page_of_a_store_sends_alerts(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_the_page_of_a_robot_sends_alerts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its node does not run."""
+    """Its node is not running."""
 
     async def run() -> None:
         async with webhook() as (hook, url), serving(tmp_path, monkeypatch, alerts=AlertSettings(url=url)):

@@ -1,4 +1,4 @@
-"""Who may what: a table of requests to the real server, and what becomes of those who are not allowed."""
+"""Authorization: a table of requests to the real server, and the responses to clients without permission."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ UPGRADE = {'Connection': 'Upgrade', 'Upgrade': 'websocket', 'Sec-WebSocket-Versi
 
 
 class Page:
-    """A server, and a client that signs in as whom it is told to."""
+    """A server, and a client that signs in with a given role."""
 
     def __init__(self, server: LiveServer, folder: Path) -> None:
         self.server, self.folder = server, folder
@@ -56,7 +56,7 @@ class Page:
 
     async def ask(self, who: str, method: str, path: str, *, csrf: bool = True, headers: dict[str, str] | None = None,
                   body: bytes = b'') -> tuple[int, dict[str, str], bytes]:  # fmt: skip
-        """As a raw request: clients would tidy up a path that climbs."""
+        """As a raw request: clients would normalize a path with ``..``."""
         reader, writer = await asyncio.open_connection('127.0.0.1', self.server.port)
         given = {'Host': f'127.0.0.1:{self.server.port}', 'Connection': 'close', 'Content-Length': str(len(body))}
         if method == 'POST' or path == '/ws':
@@ -84,13 +84,13 @@ class Page:
 
 
 async def ended(ws: aiohttp.ClientWebSocketResponse) -> None:
-    """Wait until the server has ended it."""
+    """Wait until the server has closed it."""
     while not ws.closed:
         await ws.receive(60.0)
 
 
 async def answers(ws: aiohttp.ClientWebSocketResponse, ping: int) -> None:
-    """Wait until a viewer's ping is answered, which it is while the viewer may watch."""
+    """Wait until a viewer's ping is answered, as it is while the viewer may watch."""
     await ws.send_json({'ping': ping})
     while f'"ping":{ping},'.encode() not in (await ws.receive_bytes(timeout=60.0)):
         pass
@@ -120,7 +120,7 @@ POLICY = {
     'default-src': "'none'", 'script-src': "'self'", 'style-src': "'self'", 'img-src': "'self'", 'connect-src': "'self'",
     'font-src': "'self'", 'manifest-src': "'self'", 'base-uri': "'none'", 'form-action': "'self'", 'frame-ancestors': "'none'",
 }  # fmt: skip
-"""What the page may load and who may frame it: nothing inline, nothing evaluated, nothing from elsewhere."""
+"""What the page may load and which sites may frame it: nothing inline, no eval, nothing from other hosts."""
 KEEPING_OUT = {
     'X-Content-Type-Options': 'nosniff', 'X-Frame-Options': 'DENY', 'Referrer-Policy': 'no-referrer',
     'Cross-Origin-Opener-Policy': 'same-origin', 'Cross-Origin-Resource-Policy': 'same-origin',
@@ -130,7 +130,7 @@ FOREIGN = {'Origin': 'http://evil.example'}
 CHUNKED = b'2000\r\n' + b'x' * 0x2000 + b'\r\n0\r\n\r\n'
 IN_CHUNKS = {'Content-Length': '', 'Transfer-Encoding': 'chunked'}
 TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
-    # method, path, what is special, and the status for a stranger, a viewer and an operator
+    # method, path, options, and the status for a stranger, a viewer and an operator
     ('GET', '/', {}, (200, 200, 200)),
     ('GET', '/app.js', {}, (200, 200, 200)),
     ('GET', '/../server.py', {}, (404, 404, 404)),
@@ -142,9 +142,9 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('GET', '/api/session', {'headers': REBOUND}, (403, 403, 403)),
     ('GET', '/viewer.token', {}, (404, 404, 404)),
     ('GET', '/api/past/robots', {}, (401, 200, 200)),
-    ('GET', '/api/gaps', {}, (401, 503, 503)),  # there is no spool
+    ('GET', '/api/gaps', {}, (401, 503, 503)),  # no spool
     ('GET', '/api/gaps?from=-1', {}, (401, 400, 400)),
-    ('GET', '/api/past/days', {}, (401, 503, 503)),  # there is no spool
+    ('GET', '/api/past/days', {}, (401, 503, 503)),  # no spool
     ('GET', '/api/past/days?robot=../x', {}, (401, 400, 400)),
     ('GET', '/api/past/moment?at=1e9', {}, (401, 400, 400)),
     ('GET', '/api/past/moment', {}, (401, 400, 400)),
@@ -173,18 +173,18 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('POST', '/api/label', {'body': LABEL.replace(b'5', b'true')}, (401, 403, 400)),
     ('POST', '/api/label', {'body': LABEL.replace(b'x', b'x' * MAX_BODY)}, (413, 413, 413)),
     ('GET', '/api/label', {}, (401, 404, 404)),
-    ('POST', '/api/pull', {'body': PULL}, (401, 403, 503)),  # there is no spool
+    ('POST', '/api/pull', {'body': PULL}, (401, 403, 503)),  # no spool
     ('POST', '/api/pull', {'body': PULL, 'csrf': False}, (401, 403, 403)),
     ('POST', '/api/pull', {'body': PULL, 'headers': FOREIGN}, (403, 403, 403)),
     ('POST', '/api/pull', {'body': PULL.replace(b'thor', b'../x')}, (401, 403, 400)),
     ('POST', '/api/pull', {'body': PULL.replace(b'"x"', b'5')}, (401, 403, 400)),
     ('POST', '/api/pull', {'body': PULL.replace(b'6', b'-6')}, (401, 403, 400)),
-    ('GET', '/api/past/requests', {}, (401, 503, 503)),  # there is no spool
+    ('GET', '/api/past/requests', {}, (401, 503, 503)),  # no spool
     ('GET', '/api/past/recent', {}, (401, 200, 200)),  # empty without a spool
     ('GET', '/api/past/range?from=5&to=6', {}, (401, 503, 503)),
     ('GET', '/api/past/range?from=5', {}, (401, 400, 400)),
     ('GET', '/api/past/fleet', {}, (401, 200, 200)),
-    ('POST', '/api/cut', {'body': CUT}, (401, 503, 503)),  # there is no such bag
+    ('POST', '/api/cut', {'body': CUT}, (401, 503, 503)),  # no such bag
     ('POST', '/api/cut', {'body': CUT, 'csrf': False}, (401, 403, 403)),
     ('POST', '/api/cut', {'body': CUT, 'headers': FOREIGN}, (403, 403, 403)),
     ('POST', '/api/cut', {'body': CUT.replace(b'bumped', b'../x')}, (401, 400, 400)),
@@ -199,7 +199,7 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('DELETE', '/api/session', {}, (403, 403, 403)),
     ('POST', '/api/act', {'body': CHUNKED, 'headers': IN_CHUNKS}, (401, 403, 413)),
     ('POST', '/api/session', {'body': CHUNKED, 'headers': IN_CHUNKS}, (413, 413, 413)),
-    # bytes that are no text
+    # bytes that are not text
     ('GET', '/', {'headers': {'Host': '\udcff'}}, (403, 403, 403)),
     ('GET', '/api/session', {'headers': {'Cookie': 'shadowhound_live=viewer.9999999999.\udcff.x'}}, (401, 401, 401)),
     ('GET', '/api/session', {'headers': {'Cookie': 'shadowhound_live=viewer.9999999999.x.\udcff'}}, (401, 401, 401)),
@@ -212,13 +212,13 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
 
 
 def policy(headers: dict[str, str]) -> dict[str, str]:
-    """Directive -> sources, of an answer's Content-Security-Policy."""
+    """Directive -> sources, from a response's Content-Security-Policy."""
     parts = (part.strip().partition(' ') for part in headers['Content-Security-Policy'].split(';'))
     return {directive: sources for directive, _, sources in parts}
 
 
 def test_each_request_is_allowed_for_its_roles_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each as a stranger, as a viewer and as an operator; every answer has the headers that keep others out, and no token."""
+    """Each as a stranger, as a viewer and as an operator; every response has the security headers, and no token."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -239,7 +239,7 @@ def test_each_request_is_allowed_for_its_roles_only(tmp_path: Path, monkeypatch:
 
 
 def test_each_act_names_its_operator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The operator and the address, for its log and for the manifest of an event; the page cannot say another name."""
+    """The operator and the address, for its log and for the manifest of an event; the page cannot send another name."""
     asked: list[tuple[str, dict[str, str]]] = []
 
     def ask(do: str, **given: str) -> dict[str, Any]:
@@ -259,7 +259,7 @@ def test_each_act_names_its_operator(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_clients_with_wrong_tokens_must_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beyond a few, an address is not heard for a while, the right token neither; whoever is signed in stays."""
+    """After a few, an address is refused for a while, even with a valid token; existing sign-ins continue."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -277,7 +277,7 @@ def test_clients_with_wrong_tokens_must_wait(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cookie is worth nothing then, wherever it was copied to."""
+    """The cookie is invalid then, including copies."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -292,7 +292,7 @@ def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, mon
 
 @pytest.mark.parametrize('bind', ['0.0.0.0', '127.0.0.1'])
 def test_a_sign_in_replaces_the_previous_cookie(bind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever that cookie was copied to, also after the page restarts; a wrong token ends nothing, nor does a forged cookie."""
+    """Including copies of that cookie, also after the page restarts; a wrong token or a forged cookie ends nothing."""
     monkeypatch.setattr(module, 'CHECK_S', 0.05)
     right, wrong = (json.dumps({'token': token}).encode() for token in ('{}', 'x' * 30))
 
@@ -338,8 +338,6 @@ def test_a_sign_in_replaces_the_previous_cookie(bind: str, tmp_path: Path, monke
 def test_a_sign_in_is_not_refused_where_the_disk_does_not_keep_the_end_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The log says it."""
-
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
             (page.folder / f'viewer.{SIGN_OUTS_FILE}.part').mkdir()
@@ -353,7 +351,7 @@ def test_a_sign_in_is_not_refused_where_the_disk_does_not_keep_the_end_of_anothe
 
 def test_a_sign_out_ends_its_connections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All tabs of that browser, immediately; those of another sign-in with the same token continue."""
-    monkeypatch.setattr(module, 'CHECK_S', 3600.0)  # nobody else looks who may watch
+    monkeypatch.setattr(module, 'CHECK_S', 3600.0)  # no periodic check interferes
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession(headers={'Origin': page.origin}) as session:
@@ -378,7 +376,7 @@ def test_a_sign_out_ends_its_connections(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_sign_out_outlasts_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the page: the cookie stays invalid, and nobody else has to sign in again."""
+    """After a restart of the page the cookie stays invalid, and no other client must sign in again."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -396,7 +394,7 @@ def test_a_sign_out_outlasts_a_restart(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_sign_out_that_cannot_be_stored_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It holds until the page restarts; whoever signs out and the log are told that it does not for longer."""
+    """It is valid until the page restarts; the user and the log get the warning that it is valid no longer than that."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -411,7 +409,7 @@ def test_a_sign_out_that_cannot_be_stored_is_reported(
 
 @pytest.mark.parametrize('how', ['new tokens', 'others may read it', 'it is gone', 'twelve hours'])
 def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
-    """Within some rounds; a viewer cannot come back by it. The other role continues if its token is valid."""
+    """Within some rounds; a viewer cannot reconnect with it. The other role continues if its token is valid."""
     monkeypatch.setattr(module, 'CHECK_S', 0.05)
 
     async def run() -> None:
@@ -441,7 +439,7 @@ def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monk
 
 
 def test_viewers_without_tokens_keep_watching_when_tokens_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the loopback; an operator there is ended and may come back as a viewer."""
+    """On the loopback; an operator's connection there is closed and may reconnect as a viewer."""
     monkeypatch.setattr(module, 'CHECK_S', 0.05)
 
     async def run() -> None:
@@ -466,7 +464,7 @@ def test_viewers_without_tokens_keep_watching_when_tokens_change(tmp_path: Path,
 
 
 def test_on_loopback_viewers_need_no_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Acting needs the token of the operator everywhere."""
+    """Actions need the operator's token everywhere."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch, '127.0.0.1') as page:
@@ -477,7 +475,7 @@ def test_on_loopback_viewers_need_no_token(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_the_viewers_and_their_messages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One too many is told to wait; a message that is too large ends its connection alone."""
+    """One too many gets an error; a message that is too large only ends its connection."""
 
     async def run() -> None:
         async with (
@@ -509,7 +507,7 @@ def test_the_viewers_and_their_messages_are_bounded(tmp_path: Path, monkeypatch:
 def test_invalid_http_does_not_fill_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It is answered, and nobody finds it in the log."""
+    """It gets a response, and no log entry."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -528,7 +526,7 @@ def test_invalid_http_does_not_fill_the_log(
 
 
 def test_a_frame_of_a_gigabyte_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a WebSocket says it will send is not waited for."""
+    """The server does not wait for the announced data."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch, '127.0.0.1') as page:
@@ -540,14 +538,14 @@ def test_a_frame_of_a_gigabyte_is_refused_by_its_header(tmp_path: Path, monkeypa
             await asyncio.wait_for(reader.readuntil(b'\r\n\r\n'), 60)
             writer.write(b'\x82\xff' + (1 << 30).to_bytes(8, 'big') + bytes(4))
             while await asyncio.wait_for(reader.read(1 << 16), 60):
-                pass  # until it has ended the connection
+                pass  # until it has closed the connection
             writer.close()
 
     asyncio.run(run())
 
 
 def test_frequent_changes_of_a_viewer_rarely_change_subscriptions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each change makes and ends subscriptions, which the whole network of the robot hears of."""
+    """Each change creates and removes subscriptions, which is discovered by the whole network of the robot."""
     monkeypatch.setattr(module, 'FIGURES_S', 3600.0)
 
     async def run() -> None:
@@ -564,14 +562,14 @@ def test_frequent_changes_of_a_viewer_rarely_change_subscriptions(tmp_path: Path
                     pass
                 if not seen or page.server.viewers.wanted != seen[-1]:
                     seen.append(page.server.viewers.wanted)
-            assert len(seen) <= 3  # what happens each second looks as well
+            assert len(seen) <= 3  # the periodic check runs as well
             await viewer.close()
 
     asyncio.run(run())
 
 
 def test_idle_connections_block_no_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Connections that never say what they want, or say it for ever, go; a viewer stays, and others are answered."""
+    """Connections that never complete a request are closed; a viewer stays, and other clients get responses."""
     monkeypatch.setattr(module, 'MAX_CONNECTIONS', 8)
 
     async def run() -> None:
@@ -607,14 +605,14 @@ def test_idle_connections_block_no_client(tmp_path: Path, monkeypatch: pytest.Mo
     ('evil.example', False), ('', False), ('[::1', False), ('127.0.0.1.evil.example', False), ('127.0.0.1@evil.example', False),
 ])  # fmt: skip
 def test_the_page_has_its_names_and_the_address_that_was_asked(host: str, own: bool) -> None:
-    """A name that leads here and is none of ours is an attack."""
+    """Another host name that resolves to it is an attack."""
     names = OwnNames('127.0.0.1', ['thor.lan'])
-    for address in ('10.1.2.3', '::ffff:10.1.2.3'):  # the same, as a socket of IPv6 tells it
+    for address in ('10.1.2.3', '::ffff:10.1.2.3'):  # the same as an IPv6 socket shows it
         assert names.has(host, address) is own
 
 
 def test_the_page_is_small_and_loads_nothing_from_elsewhere() -> None:
-    """At most 270 KB compressed, bundles included, 110 KB before 3D is in view; each is made of the versions that are pinned."""
+    """At most 270 KB compressed, bundles included, 110 KB before 3D is visible; each is built from the pinned versions."""
     files = {name: (body, packed) for name, (body, packed, _, _) in module._static(module.PAGE)}
     served = {name: each for name, each in files.items() if not name.endswith(('.txt', 'SUMS'))}
     assert sum(len(packed) for _, packed in served.values()) < 270_000

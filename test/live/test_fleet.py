@@ -1,4 +1,4 @@
-"""All robots of a store at a glance: the state of each, their order, and the table in a real Chromium."""
+"""All robots of a store at a glance: their states, their order, and the table in a real Chromium."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def store_of(folder: Path, now_ns: int) -> None:
-    """Four robots that were seen a moment ago, two days ago, or a month ago, and a folder that is none."""
+    """Four robots last seen a moment ago, two days ago, or a month ago, and a folder that is not a robot's."""
     with closing(open_store(folder_store(folder), UploadSettings())) as store:
         for name, at_ns in (('thor', now_ns), ('loki', now_ns), ('odin', now_ns - 2 * DAY_NS), ('freya', now_ns - 30 * DAY_NS)):
             rows = [
@@ -37,7 +37,7 @@ def store_of(folder: Path, now_ns: int) -> None:
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the store is a folder."""
+    """A home with a directory store."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     return tmp_path
@@ -45,14 +45,14 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def robots(home: Path) -> Path:
-    """The robots at noon, and what one of them lost."""
+    """The robots at noon, and the losses of one of them."""
     store_of(home, NOON_NS)
     tell(folder_store(home), home, lost('1', 3, 4, cause='transport', topic='/imu', count=7), mark(8, topic='/imu'))
     return home
 
 
 def test_robots_that_need_attention_come_first(robots: Path) -> None:
-    """Losses of today, then what is fine, then what is off; of a robot that is silent for long the last day is known."""
+    """Those with losses today first, then healthy ones, then those offline; of a long-silent robot the last day is known."""
     found = overview(Bucket(folder_store(robots), 'sensor-data'), Findings(lambda _: None), NOON_NS + 60 * SECOND)
     told = [(one.robot, one.state(NOON_NS + 60 * SECOND)[0], sum(one.lost.values())) for one in found]
     assert told[0] == ('thor', WATCH, 7)
@@ -67,7 +67,7 @@ def test_robots_that_need_attention_come_first(robots: Path) -> None:
 
 
 def test_data_that_the_robot_had_and_lost_is_worse(robots: Path) -> None:
-    """Than messages that never reached it."""
+    """Than messages that it never received."""
     settings = folder_store(robots)
     tell(settings, robots, lost('2', 5, 6, kind='quarantined', cause='access_denied', topic='/imu', count=1), name='b')
     found = overview(Bucket(settings, 'sensor-data'), Findings(lambda _: None), NOON_NS + 60 * SECOND)
@@ -80,7 +80,7 @@ def test_data_that_the_robot_had_and_lost_is_worse(robots: Path) -> None:
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_the_table_of_robots_is_ordered_and_leads_to_each(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In their order, with names as text; a click shows the past of that robot."""
+    """In order, with names as text; a click shows the past of that robot."""
     store_of(home, time.time_ns() - 10 * SECOND)
     settings = LiveSettings(spool=home / 'none', robot='thor', tokens=home / 'live', port=0, is_of_store=True)
     served = Served(settings, monkeypatch)
@@ -102,13 +102,13 @@ def test_the_table_of_robots_is_ordered_and_leads_to_each(browser: Browser, home
 
 
 NAMES = ('\u202egnp.exe', '\x1b]0;title\x07\x00', 'mission ' * 1250, '\u05d0\u05d1 \u0627\u0628', f'"><{HOSTILE}', '${7*7}')
-"""Of missions: text that turns the direction or moves a cursor, 10 kB, words from right to left, code."""
+"""Mission names: text that changes the direction or moves a cursor, 10 kB, right-to-left words, code."""
 
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_hostile_names_of_missions_are_text(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the table of robots, on the timeline and in the choice of a mission they are text on one line, cut where it is long."""
+    """In the table of robots, on the timeline and in the list of missions they are text on one line, truncated if long."""
     now_ns = time.time_ns() - 60 * SECOND
     with closing(open_store(folder_store(home), UploadSettings())) as store:
         for place, name in enumerate(NAMES):

@@ -1,4 +1,4 @@
-"""Looking back: the timeline of a time and what there is of a moment, from the spool, from the store, from bags."""
+"""The past: the timeline of a period and the data of a time, from the spool, from the store, from bags."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def jpeg(shade: int) -> bytes:
 
 
 def items(body: bytes) -> dict[str, tuple[dict[str, Any], bytes]]:
-    """By topic; as the page takes them apart."""
+    """By topic, decoded as on the page."""
     found = {}
     while body:
         size, head_size = int.from_bytes(body[:4], 'little'), int.from_bytes(body[4:8], 'little')
@@ -64,7 +64,7 @@ def items(body: bytes) -> dict[str, tuple[dict[str, Any], bytes]]:
 
 
 def told(at_s: float, sensor: str, topic: str, kind: str, extension: str, **more: str) -> Row:
-    """The row of an object so many seconds after noon."""
+    """The row of an object this many seconds after noon."""
     at_ns = NOON_NS + round(at_s * SECOND)
     metadata = {'robot': 'thor', 'sensor': sensor, 'topic': topic, 'type': kind, 'count': '1', 't_start_ns': str(at_ns),
                 't_end_ns': str(at_ns), 'pose': f'{at_s:.3f} 1.000 0.5000 odom', 'battery_pct': '80', **more}  # fmt: skip
@@ -80,7 +80,7 @@ def odometry(at_s: float) -> bytes:
 
 @pytest.fixture
 def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectStore]:
-    """The folder that is the store where no server is named."""
+    """The directory that is the default store."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as opened:
@@ -92,13 +92,13 @@ Opened = Callable[..., PastReader]
 
 @pytest.fixture
 def opened(store: ObjectStore) -> Iterator[Opened]:
-    """Histories that are closed in the end."""
+    """Creates histories and closes them at the end."""
     with ExitStack() as stack:
         yield lambda source, kept=None: stack.enter_context(closing(PastReader(source, kept or StoreKept())))
 
 
 def patrol(store: ObjectStore, folder: Path) -> None:
-    """Ten seconds of camera and odometry of one mission, and the parts that tell of them."""
+    """Ten seconds of camera and odometry of one mission, and the parts with their rows."""
     rows = []
     for second in range(10):
         for sensor, topic, kind, extension, body in (
@@ -115,7 +115,7 @@ LATE_S = 146
 
 
 def late_patrol(store: ObjectStore, folder: Path) -> None:
-    """As ``patrol``, of cameras whose stamps are far behind, and a bag of them; its log times are those of arrival."""
+    """Like ``patrol``, with cameras whose stamps are far behind, and a bag of them; its log times are arrival times."""
     rows = []
     for second in range(10):
         received = str(NOON_NS + (second + LATE_S) * SECOND)
@@ -132,7 +132,7 @@ def asked(history: PastReader, at_s: float, by: str = 'stamp') -> tuple[dict[str
 
 
 def test_the_past_of_a_store_is_shown(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """What was recorded, the gaps in their causes, how far that is known, the mission; and a moment as it was."""
+    """The recorded data, the gaps by cause, their watermark, the mission; and the data at a time."""
     patrol(store, tmp_path)
     settings = folder_store(tmp_path)
     tell(settings, tmp_path, lost('1', 3, 4, cause='transport', topic='/imu'), mark(8, topic='/imu'))
@@ -160,7 +160,7 @@ def test_the_past_of_a_store_is_shown(store: ObjectStore, opened: Opened, tmp_pa
 
 
 def test_a_moment_is_of_the_clock_that_was_chosen(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """Frames in objects and in bags whose stamps are 146 s behind: at its stamp or at its arrival, never both."""
+    """Frames in objects and in bags with stamps 146 s behind: at the stamp or at the arrival, never both."""
     late_patrol(store, tmp_path)
     history = opened(StorePast())
     for at_s in (0.0, 3.5, 9.0):
@@ -182,7 +182,7 @@ def test_a_moment_is_of_the_clock_that_was_chosen(store: ObjectStore, opened: Op
 
 @pytest.mark.parametrize('by', ['stamp', 'received'])
 def test_the_timeline_is_of_the_clock_that_was_chosen(store: ObjectStore, opened: Opened, tmp_path: Path, by: str) -> None:
-    """What was recorded and what was lost are in the same place."""
+    """Recorded data and losses are at the same position."""
     late_patrol(store, tmp_path)
     lost_late = {'received_from_ns': NOON_NS + (3 + LATE_S) * SECOND, 'received_to_ns': NOON_NS + (4 + LATE_S) * SECOND}
     tell(folder_store(tmp_path), tmp_path, lost('1', 3, 4, cause='transport', topic='/camera', **lost_late))
@@ -197,7 +197,7 @@ def test_the_timeline_is_of_the_clock_that_was_chosen(store: ObjectStore, opened
 
 
 def test_messages_of_a_batch_are_shown_when_they_arrived(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """A batch whose stamp was stuck, and one that a queue held up: their offsets from the arrival change within them."""
+    """A batch with a stuck stamp, and one delayed in a queue: their offsets from the arrival change inside them."""
     rows = []
     for begin_s, stamps_s, arrival in ((0, [0] * 5, (1, 5)), (20, [20, 21, 22, 23, 24], (31, 31.004))):
         samples = [json.loads(odometry(at_s)) for at_s in stamps_s]
@@ -220,7 +220,7 @@ def test_messages_of_a_batch_are_shown_when_they_arrived(store: ObjectStore, ope
 
 
 def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """Also what arrived on another day than its stamp."""
+    """Also data that arrived on another day than its stamp."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
     spool.open()
@@ -242,7 +242,7 @@ def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_pat
 
 
 def test_the_past_of_a_spool_is_shown(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """What waits is read from the spool, what was delivered from the store."""
+    """Pending objects are read from the spool, delivered ones from the store."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
     spool.open()
@@ -270,7 +270,7 @@ NOON_NS_OF_SPOOL = 1_760_788_800 * SECOND
 
 
 def recorded(path: Path, begin_s: float, seconds: int = 1, late_s: float = 0) -> Any:
-    """A slice with ten frames and a hundred samples of an IMU a second, in chunks of 64 KiB."""
+    """A slice with ten frames and a hundred IMU samples per second, in chunks of 64 KiB."""
     camera, imu = (Channel(topic, kind, 'ros2msg', '', '', '') for topic, kind in (('/bagged', COMPRESSED_IMAGE), ('/imu', IMU)))
     vector, turn = (
         new('geometry_msgs/msg/Vector3', x=1.0, y=2.0, z=3.0),
@@ -292,7 +292,7 @@ def recorded(path: Path, begin_s: float, seconds: int = 1, late_s: float = 0) ->
 
 
 def bag(store: ObjectStore, folder: Path, name: str, event: str, seconds: int = 1, late_s: float = 0) -> list[Row]:
-    """A whole bag of one slice in the store; the rows of its files."""
+    """A complete bag of one slice in the store; returns the rows of its files."""
     (folder / 'tmp').mkdir(exist_ok=True)
     info = recorded(folder / 'tmp' / f'{name}_0.mcap', 20.0, seconds, late_s)
     key = f'thor/rosbags/{name}/{name}_0.mcap'
@@ -309,9 +309,9 @@ def bag(store: ObjectStore, folder: Path, name: str, event: str, seconds: int = 
 
 
 def test_a_bag_is_read_by_ranges(store: ObjectStore, opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The frame of the moment and the series before it come from the bag; its event is a mark, its cut a command.
+    """The frame of the time and the series before it come from the bag; its event is a mark, its cut a command.
 
-    Of a bag of a minute the store sends what is near the moment and the index: less than a fifth of it.
+    For a bag of a minute the store sends the data near the time and the index: less than a fifth of it.
     """
     name = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
     rows = bag(store, tmp_path, name, 'bump', seconds=60)
@@ -346,7 +346,7 @@ def test_a_bag_is_read_by_ranges(store: ObjectStore, opened: Opened, tmp_path: P
 
 
 def test_a_hostile_store_is_answered_without_what_is_wrong(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """Keys that climb, pictures and documents that are none, names that are code: what is sound is shown."""
+    """Keys with ``..``, invalid images and documents, names with code: the valid data is shown."""
     patrol(store, tmp_path)
     (tmp_path / 'secret.jpg').write_bytes(jpeg(7))
     joints, points = 'sensor_msgs/msg/JointState', 'sensor_msgs/msg/PointCloud2'
@@ -381,7 +381,7 @@ def test_a_hostile_store_is_answered_without_what_is_wrong(store: ObjectStore, o
 
 
 def test_labels_are_marks_and_an_operator_adds_them(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """Those in the store stand on the timeline, by whom; a new one is read back as ``label list`` reads it."""
+    """Those in the store are on the timeline, with their authors; ``label list`` reads a new one."""
     patrol(store, tmp_path)
     history = opened(StorePast())
     noon = NOON_NS // 1_000_000
@@ -408,7 +408,7 @@ def test_labels_are_marks_and_an_operator_adds_them(store: ObjectStore, opened: 
 
 def test_kept_data_is_shown_and_requested(store: ObjectStore, opened: Opened, tmp_path: Path,
                                                      monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """By the store: how much of a time is on the robot alone, a request for it, its states, and taking one back."""
+    """For a store: how much of a time is only on the robot, a request for it, its states, and its cancellation."""
     monkeypatch.setattr(kept_module, 'FRESH_S', -1.0)
     with closing(Field(tmp_path)) as field:
         field.records(*range(6))
@@ -447,7 +447,7 @@ def test_kept_data_is_shown_and_requested(store: ObjectStore, opened: Opened, tm
 
 def test_data_kept_in_a_spool_is_requested_from_its_node(store: ObjectStore, opened: Opened, tmp_path: Path,
                                                  monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """On the robot the index says how much that is; the node is asked, whose request is one as any other."""
+    """On the robot the index has the size; the request is sent to the node, and is handled like any other."""
     with closing(Field(tmp_path)) as field:
         field.records(*range(6))
 
@@ -470,7 +470,7 @@ def test_data_kept_in_a_spool_is_requested_from_its_node(store: ObjectStore, ope
 
 def test_an_unreachable_store_delays_no_timeline(opened: Opened, store: ObjectStore, tmp_path: Path,
                                                  monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """The rest is shown, and that the labels are still being read."""
+    """The rest is shown, with a note that the labels are still being read."""
     patrol(store, tmp_path)
     answers = threading.Event()
     monkeypatch.setattr(module, 'LABELS_S', 0.01)
@@ -489,14 +489,14 @@ def test_an_unreachable_store_delays_no_timeline(opened: Opened, store: ObjectSt
     {'do': 'read', 'robot': 'thor'}, {'do': 'moment', 'robot': 'thor', 'at': 10**14 * 9}, {},
 ])  # fmt: skip
 def test_an_invalid_question_is_refused(opened: Opened, question: dict[str, Any]) -> None:
-    """By an error that the process goes on after."""
+    """It gets an error, and the process continues."""
     with pytest.raises((ValueError, OverflowError)):
         opened(StorePast()).answer(question)
 
 
 @pytest.mark.long('processes that read the past')
 def test_the_idle_process_exits_and_restarts(store: ObjectStore, tmp_path: Path) -> None:
-    """After an idle while, after a kill, and after a question that took too long."""
+    """When idle, after a kill, and after a request that took too long."""
     patrol(store, tmp_path)
 
     async def gone(pid: int) -> None:
@@ -528,14 +528,14 @@ def test_the_idle_process_exits_and_restarts(store: ObjectStore, tmp_path: Path)
 
 
 def pauses(found: list[list[Any]], topic: str) -> list[tuple[int, int]]:
-    """From and to of what was recorded of a topic, in seconds after noon."""
+    """Start and end of each recorded period of a topic, in seconds after noon."""
     noon = NOON_NS_OF_SPOOL // 1_000_000
     return [(round(begin - noon) // 1000, round(end - noon) // 1000) for name, begin, end in found if name == topic]
 
 
 @pytest.mark.parametrize('by', ['stamp', 'received'])
 def test_a_timeline_of_a_spool_has_every_pause(store: ObjectStore, opened: Opened, tmp_path: Path, by: str) -> None:
-    """Though only the first and the last object of each step are read; bookkeeping is not data; ``fit`` opens at the data."""
+    """Though only the first and the last object of each step are read; housekeeping is not data; ``fit`` opens at the data."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
     spool.open()
@@ -567,7 +567,7 @@ def test_a_timeline_of_a_spool_has_every_pause(store: ObjectStore, opened: Opene
 
 
 def test_late_and_waiting_objects_are_listed(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """Of an outage of the store from 10 s on, which ended after two minutes: until when it waited; and of what waits now."""
+    """For an outage of the store from 10 s on that lasted two minutes: how long they waited; and pending objects."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
     spool.open()
@@ -594,7 +594,7 @@ def test_late_and_waiting_objects_are_listed(store: ObjectStore, opened: Opened,
 
 
 def ran(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """A command line of the page, as a shell has it."""
+    """Run a command line of the page, as in a shell."""
     words = shlex.split(command)
     assert words[0] == 'shadowhound-data'
     line = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *words[1:]]
@@ -602,7 +602,7 @@ def ran(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_commands_for_a_time_run(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """Query finds what is there, fetch and bag cut make files, export names the mission."""
+    """Query finds the data, fetch and bag cut create files, export names the mission."""
     patrol(store, tmp_path)
     name = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
     add_part(store, bag(store, tmp_path, name, 'bump', seconds=3), 'b', tmp_path / 'tmp')
@@ -625,7 +625,7 @@ def test_the_commands_for_a_time_run(store: ObjectStore, opened: Opened, tmp_pat
 
 
 def test_the_command_pulls_kept_data(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """It is told only where something of the time is on the robot."""
+    """It is shown only if some data of the time is on the robot."""
     with closing(Field(tmp_path)) as field:
         field.records(*range(6))
         history = opened(StorePast())
@@ -639,7 +639,7 @@ def test_the_command_pulls_kept_data(store: ObjectStore, opened: Opened, tmp_pat
 
 
 def test_a_plot_keeps_its_range_where_a_bag_covers_the_moment(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """What objects have of the time before what was read of the bag is in the same series."""
+    """Earlier data from objects is in the same series as the data read from the bag."""
     rows = [told(second, 'imu', '/imu', IMU, 'json') for second in range(12, 21)]
     vector, turn = {'x': 1.0, 'y': 2.0, 'z': 3.0}, {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
     for second, row in zip(range(12, 21), rows, strict=True):
@@ -661,7 +661,7 @@ def test_a_plot_keeps_its_range_where_a_bag_covers_the_moment(store: ObjectStore
 
 
 def test_the_live_view_starts_with_recorded_values(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """Series, path and battery of the spool, with the times that live items have: of a clock that only this machine knows."""
+    """Series, path and battery from the spool, with times as in live items: by a clock that only this machine has."""
     spool = new_spool(tmp_path / 'spool', FakeClock())
     spool.open()
     now_ns = time.time_ns()

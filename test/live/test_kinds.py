@@ -1,4 +1,4 @@
-"""What of a message goes to a browser."""
+"""The part of a message that is sent to a browser."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def image(pixels: Any, kind: str, **changed: Any) -> bytes:
 
 
 def test_points_round_trip_within_half_a_step() -> None:
-    """uint16 in the box of the cloud; points that are not finite are left out."""
+    """uint16 in the bounding box of the cloud; points that are not finite are skipped."""
     points = np.random.default_rng(1).uniform(-30, 30, (20_000, 3)).astype('<f4')
     points[7] = np.nan
     full, half, smallest = clouds('/points', TYPES, 12.5, cloud(points), SIZES)
@@ -83,7 +83,7 @@ def test_points_round_trip_within_half_a_step() -> None:
 
 @pytest.mark.filterwarnings('error')
 def test_absurdly_far_points_are_removed() -> None:
-    """They would make all others one point."""
+    """With them all others would collapse to one point."""
     points = np.zeros((100, 3))
     points[:4] = [[1e30, 0, 0], [0, -3.4e38, 3.4e38], [np.inf, -np.inf, np.nan], [5.0, 6.0, 7.0]]
     (item,) = clouds('/points', TYPES, 0.0, cloud(points), [FULL])
@@ -93,7 +93,7 @@ def test_absurdly_far_points_are_removed() -> None:
 
 
 def test_an_empty_cloud_and_one_of_a_single_point_are_shown() -> None:
-    """Their box has no extent."""
+    """Their bounding box has no extent."""
     for points in (np.empty((0, 3)), np.array([[1.0, 2.0, 3.0]])):
         (item,) = clouds('/points', TYPES, 0.0, cloud(points), [FULL])
         assert len(item.body) == 6 * len(points)
@@ -103,14 +103,14 @@ def test_an_empty_cloud_and_one_of_a_single_point_are_shown() -> None:
     'changed', [{'width': 1 << 30}, {'point_step': 8}, {'fields': []}, {'point_step': 0}, {'width': 0, 'point_step': 0xFFFF_FFFF}]
 )
 def test_a_cloud_that_contradicts_itself_is_rejected(changed: dict[str, Any]) -> None:
-    """Nothing is allocated for what it claims."""
+    """Nothing is allocated for the announced size."""
     with pytest.raises(Rejected):
         list(clouds('/points', TYPES, 0.0, cloud(np.zeros((10, 3)), **changed), [FULL]))
 
 
 @pytest.mark.parametrize(('encoding', 'channels'), [('bgr8', 3), ('rgb8', 3), ('rgba8', 4), ('mono8', 1)])
 def test_a_raw_image_becomes_a_jpeg_of_each_size(encoding: str, channels: int) -> None:
-    """A half and a quarter of its sides."""
+    """With a half and a quarter of its sides."""
     pixels = np.full((240, 320, channels), 128, np.uint8)
     made = list(frames('/image', IMAGE, TYPES, 0.0, image(pixels, encoding), SIZES))
     assert [simplejpeg.decode_jpeg_header(item.body)[:2] for item in made] == [(240, 320), (120, 160), (60, 80)]
@@ -118,7 +118,7 @@ def test_a_raw_image_becomes_a_jpeg_of_each_size(encoding: str, channels: int) -
 
 @pytest.mark.parametrize('kind', ['', 'jpeg', 'bgr8; jpeg compressed bgr8'])
 def test_a_compressed_image_is_sent_unchanged(kind: str) -> None:
-    """Only a smaller one is made of it; what its format is called moves the rest."""
+    """Only smaller versions are encoded; other formats are sent unchanged in all sizes."""
     jpeg = simplejpeg.encode_jpeg(np.zeros((480, 640, 3), np.uint8), 80, 'BGR')
     message = new(COMPRESSED_IMAGE, header=header(), format=kind, data=np.frombuffer(jpeg, np.uint8))
     full, small = frames('/image', COMPRESSED_IMAGE, TYPES, 0.0, cdr(message, COMPRESSED_IMAGE), [FULL, SMALLEST])
@@ -127,7 +127,7 @@ def test_a_compressed_image_is_sent_unchanged(kind: str) -> None:
 
 
 def of_too_many_pixels() -> bytes:
-    """A small JPEG whose head says 65,500 x 65,500."""
+    """A small JPEG with a header for 65,500 x 65,500."""
     jpeg = bytes(simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8), 80, 'BGR'))
     at = jpeg.index(b'\xff\xc0') + 5
     return jpeg[:at] + struct.pack('>HH', 65_500, 65_500) + jpeg[at + 4 :]
@@ -135,7 +135,7 @@ def of_too_many_pixels() -> bytes:
 
 @pytest.mark.parametrize('size', SIZES)
 def test_a_jpeg_of_too_many_pixels_is_rejected(size: int) -> None:
-    """In each size: a browser would take 17 GB for it."""
+    """At each size: a browser would need 17 GB for it."""
     message = new(COMPRESSED_IMAGE, header=header(), format='jpeg', data=np.frombuffer(of_too_many_pixels(), np.uint8))
     with pytest.raises(Rejected, match='pixels'):
         list(frames('/image', COMPRESSED_IMAGE, TYPES, 0.0, cdr(message, COMPRESSED_IMAGE), [size]))
@@ -143,14 +143,14 @@ def test_a_jpeg_of_too_many_pixels_is_rejected(size: int) -> None:
 
 @pytest.mark.parametrize('changed', [{'encoding': 'bayer'}, {'step': 1}, {'height': 1 << 20}, {'width': 0}])
 def test_an_image_that_cannot_be_shown_is_rejected(changed: dict[str, Any]) -> None:
-    """With a reason, and nothing else happens."""
+    """With a reason, and without other effects."""
     with pytest.raises(Rejected):
         list(frames('/image', IMAGE, TYPES, 0.0, image(np.zeros((8, 8, 3), np.uint8), 'bgr8', **changed), [FULL]))
 
 
 @pytest.mark.parametrize('type_name', KINDS)
 def test_broken_bytes_are_rejected(type_name: str) -> None:
-    """Of each kind."""
+    """For each kind."""
     kind, broken = KINDS[type_name], b'\0\1\0\0xyz'
 
     def show() -> None:
@@ -178,7 +178,7 @@ def test_rows_of_figures_come_with_their_times() -> None:
 
 
 def test_joints_without_end_are_cut() -> None:
-    """In number and in the length of their names."""
+    """Their number and the length of their names are limited."""
     name, empty = 'sensor_msgs/msg/JointState', np.array([])
     names = [f'{place:04}' * 25 for place in range(2000)]
     joints = cdr(new(name, header=header(), name=names, position=np.zeros(2000), velocity=empty, effort=empty), name)
@@ -192,7 +192,7 @@ def test_joints_without_end_are_cut() -> None:
     ('', ['rpy', 'gyro', 'accel']),
 ])  # fmt: skip
 def test_what_an_imu_does_not_measure_is_not_shown(unknown: str, names: list[str]) -> None:
-    """It says so by -1 as the first element of the covariance."""
+    """It is marked by -1 as the first element of the covariance."""
     name, vector = 'sensor_msgs/msg/Imu', new('geometry_msgs/msg/Vector3', x=1.0, y=2.0, z=3.0)
     given: dict[str, Any] = {'orientation': new('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
                              'angular_velocity': vector, 'linear_acceleration': vector}  # fmt: skip
@@ -204,7 +204,7 @@ def test_what_an_imu_does_not_measure_is_not_shown(unknown: str, names: list[str
 
 
 def test_the_imu_of_a_go2_reads_the_same_both_ways(tmp_path: Path) -> None:
-    """At once, and field by field; what is of another length or byte order goes the second way."""
+    """In one step, and field by field; other lengths or byte orders use the second way."""
     (tmp_path / 'share').mkdir()
     (tmp_path / 'share' / 'go2_interfaces').symlink_to(INTERFACES / 'go2_interfaces')
     name, types = 'go2_interfaces/msg/IMU', MessageTypes([tmp_path])
@@ -218,7 +218,7 @@ def test_the_imu_of_a_go2_reads_the_same_both_ways(tmp_path: Path) -> None:
 
 
 def both_ways(name: str, messages: list[tuple[float, bytes]]) -> tuple[bytes, bytes]:
-    """What a browser gets of these messages, read where CDR has it and field by field."""
+    """The browser's data for these messages, read at fixed CDR offsets and field by field."""
     kind = KINDS[name]
     assert kind.table is not None
     assert kind.table([cdr for _, cdr in messages]) is not None
@@ -228,7 +228,7 @@ def both_ways(name: str, messages: list[tuple[float, bytes]]) -> tuple[bytes, by
 
 @pytest.mark.parametrize('frame_id', ['', 'odom', 'a_frame', 'the_robot/odom'])
 def test_an_odometry_reads_the_same_both_ways(frame_id: str) -> None:
-    """Wherever its text moves the numbers."""
+    """Wherever the length of its text moves the numbers."""
     at_once, by_field = both_ways(ODOMETRY, [(10.0 * turn, odometry(frame_id, turn)) for turn in (1, 2)])
     assert at_once == by_field
 
@@ -242,7 +242,7 @@ def test_joints_read_the_same_both_ways(names: list[str]) -> None:
 
 
 def test_joints_that_are_not_as_usual_are_read_by_field() -> None:
-    """Twice the same name, none, fewer positions than names, and other names in each message."""
+    """Duplicate names, none, fewer positions than names, and different names in each message."""
     table = KINDS[JOINTS].table
     assert table is not None
     usual = joints(['a', 'b'], np.zeros(2))
@@ -254,14 +254,14 @@ def test_joints_that_are_not_as_usual_are_read_by_field() -> None:
 
 @pytest.mark.parametrize('size', [-1, -8, 60, 20, 1])
 def test_truncated_messages_are_rejected(size: int) -> None:
-    """Even where all that is shown is there."""
+    """Even if everything shown is there."""
     for name, whole in ((ODOMETRY, odometry('odom', 1)), (JOINTS, joints(['a', 'b'], np.zeros(2), np.zeros(2)))):
         with pytest.raises(Rejected):
             series('/topic', KINDS[name], name, TYPES, [(1.0, whole[:size])])
 
 
 def test_what_is_too_large_for_float32_is_infinite() -> None:
-    """As numpy has it, which reads those that are not as usual."""
+    """As in numpy, which reads unusual messages."""
     with np.errstate(over='ignore'):
         item = series('/odom', KINDS[ODOMETRY], ODOMETRY, TYPES, [(1.0, odometry('odom', 1e300))])
     assert np.isinf(np.frombuffer(item.body[8:], '<f4')[0])
@@ -286,7 +286,7 @@ def joints(names: list[str], position: Any, velocity: Any = ()) -> bytes:
 
 
 def test_a_header_is_valid_json_whatever_it_contains() -> None:
-    """Half a surrogate, of a name that somebody relays, and an integer that no other reader takes are written all the same."""
+    """Half a surrogate, in a relayed name, and an integer that other readers reject are written anyway."""
     packed = LiveItem('/a', 'topics', head={'problem': 'ö', 'rate': float('nan')}).packed
     assert opened(packed)[0] == {'topic': '/a', 'kind': 'topics', 'problem': 'ö', 'rate': None}
     head = {'problem': 'a \ud800', 'number': 10**30}
@@ -294,7 +294,7 @@ def test_a_header_is_valid_json_whatever_it_contains() -> None:
 
 
 def depth(values: Any, encoding: str, *, is_bigendian: bool = False) -> bytes:
-    """An image of distances."""
+    """A depth image."""
     height, width = values.shape
     pixels = np.frombuffer(values.tobytes(), np.uint8)
     message = new(IMAGE, header=header(), height=height, width=width, encoding=encoding, is_bigendian=int(is_bigendian),
@@ -304,7 +304,7 @@ def depth(values: Any, encoding: str, *, is_bigendian: bool = False) -> bytes:
 
 @pytest.mark.parametrize(('encoding', 'dtype', 'factor'), [('16UC1', '<u2', 1000), ('16UC1', '>u2', 1000), ('32FC1', '<f4', 1)])
 def test_an_image_of_distances_has_colors_and_their_scale(encoding: str, dtype: str, factor: int) -> None:
-    """The same colors for the same distance in all encodings; gray where nothing was measured."""
+    """The same colors for the same depth in all encodings; gray for unmeasured pixels."""
     meters = np.tile(np.linspace(0.5, 3.9, 64), (48, 1))
     meters[:, :8] = math.nan if encoding == '32FC1' else 0.0
     message = depth((meters * factor).astype(dtype), encoding, is_bigendian=dtype.startswith('>'))
@@ -317,7 +317,7 @@ def test_an_image_of_distances_has_colors_and_their_scale(encoding: str, dtype: 
 
 
 def test_an_image_of_distances_that_contradicts_itself_is_rejected() -> None:
-    """Its size is not what it says."""
+    """Its size differs from its header."""
     message = new(
         IMAGE, header=header(), height=48, width=64, encoding='16UC1', is_bigendian=0, step=128, data=np.zeros(99, np.uint8)
     )
@@ -326,7 +326,7 @@ def test_an_image_of_distances_that_contradicts_itself_is_rejected() -> None:
 
 
 def test_a_place_on_earth_is_exact_to_a_centimeter() -> None:
-    """Degrees do not fit into a float32; without a fix there is no place."""
+    """Degrees do not fit into a float32; without a fix there is no position."""
     fix = 'sensor_msgs/msg/NavSatFix'
     for status, has_fix in ((0, True), (-1, False)):
         message = new(

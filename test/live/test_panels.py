@@ -1,4 +1,4 @@
-"""What the page draws besides pictures, clouds and plots: bounded, whatever a message contains."""
+"""What the page draws in addition to images, clouds and plots: bounded, whatever a message contains."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TYPES = MessageTypes()
 
 
 def made(topic: str, type_name: str, *messages: Any) -> LiveItem:
-    """The item of messages that come together."""
+    """The item made from messages that arrive together."""
     panel = panel_of(topic, type_name)
     assert panel is not None
     return panel.maker()(topic, TYPES, type_name, [(float(at), cdr(each, type_name)) for at, each in enumerate(messages)])
@@ -41,7 +41,7 @@ def scan(ranges: Any) -> Any:
 
 
 def test_a_scan_has_its_ranges() -> None:
-    """Within 1/65,535 of the longest; 0 where nothing was measured."""
+    """Within 1/65,535 of the maximum; 0 for unmeasured ones."""
     item = made('/scan', SCAN, scan([1.0, 0.05, math.nan, math.inf, 12.0, 13.0, -1.0, 0.1]))
     values = np.frombuffer(item.body, '<u2') * head(item)['step']
     assert np.allclose(values, [1, 0, 0, 0, 12, 0, 0, 0.1], atol=1e-3)
@@ -49,7 +49,7 @@ def test_a_scan_has_its_ranges() -> None:
 
 
 def test_a_large_scan_is_thinned() -> None:
-    """Its rays stay at their angles."""
+    """Its rays keep their angles."""
     item = made('/scan', SCAN, scan(np.full(3 * MAX_RAYS, 2.0)))
     assert len(item.body) // 2 == MAX_RAYS
     assert head(item)['turn'] == pytest.approx(0.03)
@@ -65,7 +65,7 @@ def grid(width: int, height: int, cells: Any) -> Any:
 
 
 def test_a_map_has_its_cells() -> None:
-    """As they are, unknown ones as 255; a large one keeps what is occupied."""
+    """Unchanged, unknown ones as 255; a large one keeps its occupied cells."""
     item = made('/map', MAP, grid(3, 2, [0, 100, -1, 50, 0, 0]))
     assert list(zlib.decompress(item.body)) == [0, 100, 255, 50, 0, 0]
     assert (head(item)['x'], head(item)['y'], round(head(item)['yaw'], 6)) == (-1.0, 2.0, 0.2)
@@ -80,7 +80,7 @@ def test_a_map_has_its_cells() -> None:
 
 @pytest.mark.parametrize('message', [grid(3, 3, [0, 0]), grid(0, 0, []), grid(4_000_000_000, 1, [0])])
 def test_a_map_that_contradicts_itself_is_rejected(message: Any) -> None:
-    """Nothing is allocated for what it claims."""
+    """Nothing is allocated for the announced size."""
     with pytest.raises(Rejected):
         made('/map', MAP, message)
 
@@ -97,7 +97,7 @@ def transforms(*names: tuple[str, str], x: float = 1.0) -> Any:
 
 
 def test_transforms_are_collected() -> None:
-    """The newest of each child, of all messages; read where CDR has them as field by field."""
+    """The newest of each child, from all messages; read at CDR offsets as well as field by field."""
     item = made('/tf', TF, transforms(('map', 'odom'), ('odom', 'base')), transforms(('/base', 'lidar_of_odd_length')),
                 transforms(('odom', 'base'), x=7.0))  # fmt: skip
     assert head(item)['frames'] == [['map', 'odom'], ['odom', 'base'], ['base', 'lidar_of_odd_length']]
@@ -106,7 +106,7 @@ def test_transforms_are_collected() -> None:
 
 
 def test_transforms_are_bounded() -> None:
-    """Frames with ever new names, and numbers that are none; a frame that nobody publishes any more is dropped."""
+    """Frames with ever new names, and invalid numbers; a frame that is no longer published is dropped."""
     panel = panel_of('/tf', TF)
     assert panel is not None
     maker = panel.maker()
@@ -120,7 +120,7 @@ def test_transforms_are_bounded() -> None:
 
 @pytest.mark.parametrize('size', [4, 8, 12, 20, 60])
 def test_transforms_that_are_cut_off_are_rejected(size: int) -> None:
-    """Whatever their lengths say."""
+    """Whatever their lengths are."""
     whole = cdr(transforms(('map', 'odom')), TF)
     panel = panel_of('/tf', TF)
     assert panel is not None
@@ -131,7 +131,7 @@ def test_transforms_that_are_cut_off_are_rejected(size: int) -> None:
 
 
 def test_diagnostics_are_the_newest_of_each_name() -> None:
-    """Bounded in number and text."""
+    """Limited in number and text."""
 
     def status(name: str, level: int, text: str) -> Any:
         values = [new('diagnostic_msgs/msg/KeyValue', key='load', value='7')]
@@ -156,7 +156,7 @@ def test_a_log_has_its_last_lines() -> None:
 
 
 def test_a_robot_description_is_sent_unchanged() -> None:
-    """Of a topic with that name alone, and not of any size."""
+    """Only for a topic with that name, and up to a maximum size."""
     assert made('/robot_description', STRING, new(STRING, data='<robot/>')).body == b'<robot/>'
     assert panel_of('/chatter', STRING) is None
     with pytest.raises(Rejected, match='not drawn'):

@@ -1,4 +1,4 @@
-"""The page of a store, with the live view of one robot: one connection to the robot, however many watch."""
+"""The page of a store, with the live view of one robot: one connection to the robot, for any number of viewers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ async def tower(folder: Path, url: str, token: Path | None) -> AsyncIterator[Liv
 
 @asynccontextmanager
 async def answering(*routes: web.RouteDef) -> AsyncIterator[str]:
-    """Something at the robot's address that answers these alone; yields the address."""
+    """A server at the robot's address that only sends these responses; yields the address."""
     app = web.Application()
     app.add_routes(routes)
     runner = web.AppRunner(app)
@@ -59,7 +59,7 @@ async def answering(*routes: web.RouteDef) -> AsyncIterator[str]:
 
 
 class Browser:
-    """A viewer that puts items together, and the newest of each topic."""
+    """A viewer that assembles items, and the newest of each topic."""
 
     def __init__(self) -> None:
         self.newest: dict[str, tuple[dict[str, Any], bytes]] = {}
@@ -88,14 +88,14 @@ JPEG = bytes(simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8)))
 
 
 def publish(robot: LiveServer, number: int) -> None:
-    """A frame of 40 KB and a row of figures."""
+    """A frame of 40 KB and a row of values."""
     at = asyncio.get_running_loop().time() * 1e3
     frame = LiveItem(CAMERA, 'camera', head={'at': at}, body=JPEG + bytes([number % 256]) * (40_000 - len(JPEG)))
     robot.viewers.on_items([frame, table_item(IMU, KINDS['sensor_msgs/msg/Imu'], [(at, {'x': float(number)})])])
 
 
 def test_ten_viewers_cost_the_robot_one_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It signs in with the token of a viewer; frames arrive as they were, with their times; without viewers it is gone."""
+    """It signs in with the viewer token; frames arrive unchanged, with their times; without viewers it is closed."""
 
     async def run(robot: Page, page: LiveServer) -> None:
         robot.server.viewers.on_graph(GRAPH)
@@ -132,7 +132,7 @@ def test_ten_viewers_cost_the_robot_one_stream(tmp_path: Path, monkeypatch: pyte
 def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The robot would lock this address out. Whoever watches is told; the new token is taken as soon as the file has it."""
+    """The robot would lock this address out. Viewers get the reason; the new token is used as soon as the file has it."""
     monkeypatch.setattr(server, 'CHECK_S', 0.05)
     monkeypatch.setattr(relay, 'AGAIN_S', 0.01)
     monkeypatch.setattr(relay, 'REFUSED_S', 3600.0)
@@ -184,7 +184,7 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
 def test_a_rejecting_robot_is_retried_later(
     path: str, status: int, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether too many came from here, it wants a token and we have none, or it has as many viewers as it takes."""
+    """After too many attempts, without a required token, or when it has its maximum number of viewers."""
     monkeypatch.setattr(relay, 'AGAIN_S', 0.01)
     monkeypatch.setattr(relay, 'REFUSED_S', 3600.0)
     monkeypatch.setattr(relay, 'LOOK_S', 0.01)
@@ -221,7 +221,7 @@ def test_a_rejecting_robot_is_retried_later(
 
 
 def test_a_robot_that_ends_each_connection_is_asked_again_after_a_pause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And whoever watches is told why nothing comes."""
+    """And viewers see the reason."""
     monkeypatch.setattr(relay, 'AGAIN_S', 3600.0)
     asked: list[str] = []
 
@@ -244,7 +244,7 @@ def test_a_robot_that_ends_each_connection_is_asked_again_after_a_pause(tmp_path
 
 
 def test_a_viewer_during_disconnect_sees_the_robot_immediately() -> None:
-    """As who loads the page of Tower anew: that the robot answers the end of a connection that nobody needed is no fault."""
+    """As after a reload of Tower's page: the robot's reply to closing an unused connection is not an error."""
     came: list[float] = []
     told: list[Any] = []
 
@@ -254,7 +254,7 @@ def test_a_viewer_during_disconnect_sees_the_robot_immediately() -> None:
         await ws.prepare(request)
         async for _ in ws:
             pass
-        await asyncio.sleep(0.2)  # the way back
+        await asyncio.sleep(0.2)  # the return path
         await ws.close()
         return ws
 
@@ -306,7 +306,7 @@ PONG = WHOLE + LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed
     WHOLE + LiveItem('/a', 'camera', head={'at': 1.0}, body=of_too_many_pixels()).packed,
 ])  # fmt: skip
 def test_an_invalid_robot_page_is_reported(tmp_path: Path, said: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page of the store goes on, and says why there is no live view."""
+    """The page of the store continues, and shows why there is no live view."""
     monkeypatch.setattr('shadowhound_data_logger.live.relay.AGAIN_S', 0.01)
 
     async def nonsense(request: web.Request) -> web.StreamResponse:

@@ -1,4 +1,4 @@
-"""The cameras over RTSP: read back by GStreamer, with the password and without."""
+"""The cameras over RTSP: played by GStreamer, with and without the password."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ def progressive() -> bytes:
     (jpeg(481, 640), '481'), (jpeg(8, 2048), '2048'), (b'', 'not a JPEG'), (progressive(), 'baseline'),
 ])  # fmt: skip
 def test_jpegs_unsupported_by_rfc_2435_are_reported(picture: bytes, word: str) -> None:
-    """Sizes, sampling and coding of a JPEG decide."""
+    """It depends on the size, subsampling and coding of a JPEG."""
     assert word in unsuited(picture)
     assert bool(word) is bool(unsuited(picture))
 
 
 def test_the_password_is_in_a_file_of_its_owner(tmp_path: Path) -> None:
-    """It stays the same until new tokens are made."""
+    """It is unchanged until new tokens are created."""
     make_tokens(tmp_path)
     first = rtsp_password(tmp_path)
     assert len(first) > 20
@@ -70,7 +70,7 @@ def test_the_password_is_in_a_file_of_its_owner(tmp_path: Path) -> None:
 
 
 def test_a_missing_gstreamer_has_a_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Whether there is no Python of the system, or one without bindings."""
+    """If there is no system Python, or one without bindings."""
 
     async def run() -> str:
         server = RtspServer('127.0.0.1', 0, 'secret', lambda: None)
@@ -90,12 +90,12 @@ def test_a_missing_gstreamer_has_a_remedy(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 def hashed(text: str) -> str:
-    """As RFC 2617 has it."""
+    """As in RFC 2617."""
     return new('md5', text.encode(), usedforsecurity=False).hexdigest()
 
 
 class Player:
-    """A client of RTSP (RFC 2326) of our own, for what others do not show: who is refused, and the marks of packets."""
+    """Our RTSP client (RFC 2326), for what others do not show: refusals, and the marks of packets."""
 
     def __init__(self, url: str, password: str | None) -> None:
         self.url, self.password = url, password
@@ -103,7 +103,7 @@ class Player:
         self._host, self._number, self._challenge = host, 0, dict[str, str]()
 
     def ask(self, method: str, url: str = '', **headers: str) -> tuple[int, str]:
-        """Status and text of the answer; asked again with the password where one is wanted."""
+        """Status and text of the response; repeated with the password if required."""
         status, text = self._ask(method, url or self.url, headers)
         if status == 401 and self.password is not None and not self._challenge:
             self._challenge = dict(re.findall(r'(\w+)="([^"]*)"', next(line for line in text.splitlines() if 'Digest' in line)))
@@ -134,7 +134,7 @@ class Player:
 
 
 async def until_served(url: str) -> None:
-    """The process hears of a topic a moment after the page."""
+    """The process learns of a topic a moment after the page."""
 
     def status() -> int:
         with contextlib.closing(Player(url, None)) as player:
@@ -147,7 +147,7 @@ async def until_served(url: str) -> None:
 
 
 def tos_of_packets(url: str, password: str, count: int) -> tuple[str, set[int]]:
-    """The description of what is played, and the marks of so many RTP packets."""
+    """The description of the stream, and the marks of this many RTP packets."""
     with contextlib.ExitStack() as stack:
         player = stack.enter_context(contextlib.closing(Player(url, password)))
         rtp, rtcp = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
@@ -172,7 +172,7 @@ def tos_of_packets(url: str, password: str, count: int) -> tuple[str, set[int]]:
 
 @pytest.mark.long("GStreamer's RTSP server")
 def test_rtsp_requires_the_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without any it is 401, as with a wrong one; packets are marked as interactive video (AF41)."""
+    """Without one or with a wrong one it is 401; packets are marked as interactive video (AF41)."""
     if not has_gstreamer():
         pytest.skip(f'no GStreamer is installed here: {INSTALL}')
 
@@ -197,12 +197,12 @@ def test_rtsp_requires_the_password(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.long("GStreamer's RTSP server and client")
 def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the password, the very JPEGs; without it, nothing. A topic is read while somebody plays it, from where is known."""
+    """With the password, the same JPEGs; without it, nothing. A topic is read while a player uses it, with a known address."""
     if not has_gstreamer():
         pytest.skip(f'no GStreamer is installed here: {INSTALL}')
 
     async def play(url: str, password: str, out: Path) -> str:
-        """Until four frames are there, or the player has ended."""
+        """Until four frames have arrived, or the player has exited."""
         out.mkdir()
         command = f'gst-launch-1.0 -q rtspsrc location={url} protocols=tcp user-id=viewer ! rtpjpegdepay ! multifilesink'.split()
         command[5:5] = [f'user-pw={password}']
@@ -248,6 +248,6 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             async def has_left() -> bool:
                 return await is_idle() and rtsp.players == ()
 
-            await until(has_left, 'nothing is read, and nobody plays')
+            await until(has_left, 'no topic is read, and there are no players')
 
     asyncio.run(run())

@@ -1,4 +1,4 @@
-"""What the server writes to those who watch."""
+"""The data that the server writes to viewers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def closed_server(folder: Path, **settings: Any) -> LiveServer:
 
 
 async def watched(server: LiveServer, items: list[LiveItem]) -> list[tuple[str, int, bytes]]:
-    """Topic, number and body of what comes to a viewer of ``/small`` and ``/large`` of these items, told at once."""
+    """Topic, number and body received by a viewer of ``/small`` and ``/large`` from these items, shown at the same time."""
     origin = f'http://127.0.0.1:{server.port}'
     frames, found = Frames(), list[tuple[str, int, bytes]]()
     async with aiohttp.ClientSession(headers={'Origin': origin}) as session, session.ws_connect(f'{origin}/ws') as ws:
@@ -41,7 +41,7 @@ async def watched(server: LiveServer, items: list[LiveItem]) -> list[tuple[str, 
         async for message in ws:
             assert message.type is aiohttp.WSMsgType.BINARY
             for head, body in frames.take(message.data):
-                if head['kind'] == 'pong':  # by now it is known what is watched
+                if head['kind'] == 'pong':  # by now the watched topics are known
                     server.viewers.on_items(items)
                 elif head['topic']:
                     found.append((head['topic'], head['number'], body))
@@ -53,7 +53,7 @@ async def watched(server: LiveServer, items: list[LiveItem]) -> list[tuple[str, 
 
 
 def test_items_of_every_size_arrive_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However RFC 6455 tells their length, small ones first, large ones as the viewer acknowledges them."""
+    """However RFC 6455 encodes their length, small ones first, large ones as the viewer acknowledges them."""
     monkeypatch.setattr(module, 'find_spec', lambda _: None)  # no ROS here
     small = [LiveItem('/small', 'imu', FULL, {'number': size}, bytes([size % 251]) * size) for size in (0, 60, 500, 70_000)]
     large = LiveItem('/large', 'camera', FULL, {'number': 7}, b'\xff\xd8' * 300_000)
@@ -71,7 +71,7 @@ def test_items_of_every_size_arrive_complete(tmp_path: Path, monkeypatch: pytest
 
 
 def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not that of the variables with which the page was started: the home of its spool, and its robot."""
+    """Not that of the page's environment variables: the home of its spool, and its robot."""
     doctor = tmp_path / 'doctor'
     said = """'{"asked": "%s", "home": "%s", "robot": "%s"}' "$*" "$SHADOWHOUND_HOME" "$SHADOWHOUND_ROBOT\""""
     doctor.write_text(f'#!/bin/sh\nprintf {said}\n')
@@ -98,7 +98,7 @@ def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypat
 
 
 def test_viewers_on_other_machines_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Viewers and players of RTSP alike; on the page of a store nobody does."""
+    """Viewers and RTSP players; the page of a store reports none."""
     robot, store = closed_server(tmp_path), closed_server(tmp_path, is_of_store=True)
     assert not robot.viewers.is_watched_remotely
     near, far = ('127.0.0.1', '::1', '::ffff:127.0.0.1'), ('10.77.0.2', '::ffff:10.77.0.2', 'fe80::2%eth0')
@@ -114,7 +114,7 @@ def test_viewers_on_other_machines_are_known(tmp_path: Path, monkeypatch: pytest
 
 
 def test_video_is_suggested_on_a_link_that_stays_narrow(tmp_path: Path) -> None:
-    """Each time that it was narrow for ten seconds without a break; not without a camera, and not where there is no video."""
+    """Each time that it was narrow for ten seconds without a break; not without a camera, and not without video support."""
     told: list[LiveItem] = []
     viewer = Viewer()
     one: Any = SimpleNamespace(viewer=viewer, narrow_s=None, tell=told.append)
@@ -150,7 +150,7 @@ def test_video_is_suggested_on_a_link_that_stays_narrow(tmp_path: Path) -> None:
 
 
 def test_a_page_on_a_narrow_link_is_notified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It gets frames that the link does not carry in full, and after a while the word."""
+    """It gets frames that exceed the link, and after a while the suggestion."""
     monkeypatch.setattr(module, 'FIGURES_S', 0.05)
     monkeypatch.setattr(viewers_module, 'NARROW_S', 0.3)
 
@@ -166,7 +166,7 @@ def test_a_page_on_a_narrow_link_is_notified(tmp_path: Path, monkeypatch: pytest
                 await ws.send_json({'watch': [CAMERA], 'ping': 1.0})
                 while True:
                     for head, _ in frames.take((await ws.receive(60)).data):
-                        if head['kind'] == 'pong':  # by now it is known what is watched
+                        if head['kind'] == 'pong':  # by now the watched topics are known
                             page.server.viewers.on_items([LiveItem(CAMERA, 'camera', FULL, {'at': 1.0}, bytes(500_000))])
                         if head['kind'] == 'video':
                             return head
@@ -175,7 +175,7 @@ def test_a_page_on_a_narrow_link_is_notified(tmp_path: Path, monkeypatch: pytest
 
 
 def test_status_shows_what_uploads_wait_for(tmp_path: Path) -> None:
-    """The rule and why it does not hold, and how long it takes until all has arrived, as the node's status has them."""
+    """The rule and why it does not hold, and how long it takes until everything has arrived, as in the node's status."""
     said = {'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}, 'left_s': 754}
     written(tmp_path, store={'state': 'waiting', **said})
     store = SpoolFigures(tmp_path, 'thor', FakeClock()).now(with_ledger=False)['store']
@@ -185,7 +185,7 @@ def test_status_shows_what_uploads_wait_for(tmp_path: Path) -> None:
 def test_a_failed_task_is_logged_immediately(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Nobody would notice that connections no longer end with their sign-in."""
+    """Otherwise connections would silently stop ending with their sign-in."""
 
     async def fails(_: LiveServer) -> None:
         raise ValueError('it cannot be asked')
@@ -203,7 +203,7 @@ def test_a_failed_task_is_logged_immediately(
 
 @pytest.mark.parametrize('is_of_store', [False, True])
 def test_the_round_trip_to_each_viewer_is_known(is_of_store: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To this machine it is short; it is asked for again, for that of the first packets may have been a long one."""
+    """To this machine it is short; it is measured again, since that of the first packets may have been long."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch, is_of_store=is_of_store) as page:
@@ -227,7 +227,7 @@ def test_the_round_trip_to_each_viewer_is_known(is_of_store: bool, tmp_path: Pat
 
 
 def test_false_acknowledgments_gain_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What waits for him in this process is bounded."""
+    """The data waiting for that viewer in this process is bounded."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -259,7 +259,7 @@ def test_false_acknowledgments_gain_nothing(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_memory_is_trimmed_without_viewers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not while somebody does, and not again while nobody comes."""
+    """Not while there are viewers, and not repeatedly while there are none."""
     trimmed: list[int] = []
 
     async def run() -> None:

@@ -1,4 +1,4 @@
-"""What is read from ROS, and how often: real publishers, and viewers without a browser."""
+"""Subscriptions and their rates: real publishers, and viewers without a browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SOON_S = 10.0
 
 
 class Tab:
-    """A viewer, and when (``at``) what it got of each topic came to the robot."""
+    """A viewer, and when (``at``) the items that it got of each topic arrived at the robot."""
 
     def __init__(self, ws: aiohttp.ClientWebSocketResponse) -> None:
         self._ws = ws
@@ -35,7 +35,7 @@ class Tab:
         self.at: dict[str, set[float]] = {}
 
     async def watch(self, *topics: str) -> None:
-        """These and no others; a hidden tab says that it watches none."""
+        """Watch exactly these; a hidden tab watches none."""
         await self._ws.send_json({'watch': topics})
 
     async def read(self) -> None:
@@ -48,14 +48,14 @@ class Tab:
                 elif head['topic']:
                     self.heads[head['topic']] = head
                     self.at.setdefault(head['topic'], set()).add(head['at'])
-                elif head['kind'] == 'figures':  # each second, in which a page says something too
+                elif head['kind'] == 'figures':  # each second, in which a page sends something too
                     await self._ws.send_json({'ping': 1})
             if (said := frames.acknowledgement()) is not None:
                 await self._ws.send_bytes(said)
 
 
 class Robot:
-    """Publishers, and the live page of them."""
+    """Publishers, and their live page."""
 
     def __init__(self, server: LiveServer, node: Any) -> None:
         from sensor_msgs.msg import Image, Imu
@@ -65,13 +65,13 @@ class Robot:
         self.publishers = {topic: node.create_publisher(kind, topic, 10) for topic, kind in types.items()}
 
     def read(self) -> dict[str, int]:
-        """How many subscriptions each topic has that has any."""
+        """Topic -> number of subscriptions, if any."""
         counts = {topic: publisher.get_subscription_count() for topic, publisher in self.publishers.items()}
         return {topic: count for topic, count in counts.items() if count}
 
     @asynccontextmanager
     async def tab(self) -> AsyncIterator[Tab]:
-        """A viewer that knows the topics and watches none yet."""
+        """A viewer that has the list of topics and watches none yet."""
         async with (
             aiohttp.ClientSession(headers={'Origin': self._origin}) as session,
             session.ws_connect(f'{self._origin}/ws') as ws,
@@ -86,7 +86,7 @@ class Robot:
                 await asyncio.gather(reading, return_exceptions=True)
 
     async def shown(self, topic: str, message: Any, *tabs: Tab) -> None:
-        """Publish until each of them got one more than it has."""
+        """Publish until one more item of each has arrived."""
         before = [len(tab.at.get(topic, ())) for tab in tabs]
 
         def came() -> bool:
@@ -118,7 +118,7 @@ async def robot(folder: Path) -> AsyncIterator[Robot]:
 
 
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, doing: Callable[[Robot], Any]) -> None:
-    """With a robot, in a domain of its own."""
+    """Run with a robot, in a separate domain."""
     pytest.importorskip('rclpy')
 
     async def with_robot() -> None:
@@ -131,7 +131,7 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, doing: Callable[[Robot], 
 
 
 def test_a_topic_is_read_once_and_only_while_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the publishers see it: no subscription before, one however many watch, none once the last tab hides or leaves."""
+    """As the publishers count: no subscription before, one for any number of viewers, none once the last tab hides or leaves."""
 
     async def doing(found: Robot) -> None:
         from sensor_msgs.msg import Imu
@@ -153,13 +153,13 @@ def test_a_topic_is_read_once_and_only_while_watched(tmp_path: Path, monkeypatch
                 await second.watch(OTHER)
                 await found.shown(OTHER, Imu(), second)
                 assert found.read() == {OTHER: 1}
-            await until(lambda: found.read() == {}, 'who watched has left, the other is hidden', SOON_S)
+            await until(lambda: found.read() == {}, 'no visible tab is left', SOON_S)
 
     run(tmp_path, monkeypatch, doing)
 
 
 def test_a_raw_image_is_encoded_once_for_all_viewers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three of them: as many JPEGs are made as images are shown, and each viewer gets them all."""
+    """Three of them: as many JPEGs are encoded as images are shown, and each viewer gets all."""
     encode, made = kinds.simplejpeg.encode_jpeg, list[int]()
 
     def counted(*given: Any, **more: Any) -> bytes:
@@ -184,7 +184,7 @@ def test_a_raw_image_is_encoded_once_for_all_viewers(tmp_path: Path, monkeypatch
 
 
 def test_topics_with_a_publisher_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever their names: of more topics than can be told, those are cut that nobody publishes."""
+    """With any names: if there are too many topics, those without a publisher are cut."""
     from shadowhound_data_logger.live import topics
 
     monkeypatch.setattr(topics, 'MAX_TOPICS', 20)
@@ -197,7 +197,7 @@ def test_topics_with_a_publisher_come_first(tmp_path: Path, monkeypatch: pytest.
             found.node.create_subscription(Imu, f'/a_{number}', lambda _: None, 1)
         publisher = found.node.create_publisher(Float32, '/zzz', 1)
         async with found.tab() as tab:
-            await until(lambda: '/zzz' in tab.topics, 'the topic is told')
+            await until(lambda: '/zzz' in tab.topics, 'the topic is listed')
             assert len(tab.topics) == 20
             publishers = [count for *_, count in tab.told.values()]
             assert publishers == sorted(publishers, key=lambda count: count < 1)
@@ -211,7 +211,7 @@ def test_topics_with_a_publisher_come_first(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_any_topic_is_a_tree_and_its_numbers_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With one subscription, which exists only while a viewer watches it; a path that leads nowhere says so."""
+    """With one subscription, which exists only while a viewer watches it; a path that leads nowhere is reported."""
     wave, number, wrong = '/wave#', '/wave#data', '/wave#data.x'
 
     async def doing(found: Robot) -> None:
@@ -244,7 +244,7 @@ def test_any_topic_is_a_tree_and_its_numbers_are_rows(tmp_path: Path, monkeypatc
 
 
 def test_what_was_published_once_is_shown_to_all_who_come_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A map, to the first viewer and to a second one; also when its publisher starts after the viewer began to watch."""
+    """A map, to the first viewer and to a second one; also if its publisher starts after the viewer started to watch."""
 
     async def doing(found: Robot) -> None:
         from nav_msgs.msg import OccupancyGrid

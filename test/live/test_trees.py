@@ -1,4 +1,4 @@
-"""A message of any type as a tree, and single numbers of it."""
+"""A message of any type as a tree, and individual numbers of it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def scan(count: int) -> Any:
 
 
 def test_a_tree_has_names_types_and_values() -> None:
-    """Arrays with their lengths and first elements, numbers that JSON has not as text."""
+    """Arrays with their lengths and first elements, numbers without a JSON representation as text."""
     found = tree(TYPES, SCAN, scan(500))
     assert found['t'] == SCAN
     assert found['f']['angle_min'] == 0.5
@@ -37,7 +37,7 @@ def test_a_tree_has_names_types_and_values() -> None:
 
 
 def test_a_tree_is_small() -> None:
-    """Of a text of a megabyte, and of a thousand statuses with a thousand values each."""
+    """For a text of a megabyte, and for a thousand statuses with a thousand values each."""
     text = TYPES.deserialize(STRING, cdr(new(STRING, data='x' * 1_000_000), STRING))
     assert len(tree(TYPES, STRING, text)['f']['data']) == MAX_TEXT + 1
     values = [new('diagnostic_msgs/msg/KeyValue', key='k' * 400, value='v' * 400) for _ in range(100)]
@@ -47,7 +47,7 @@ def test_a_tree_is_small() -> None:
 
 
 def test_a_number_is_found_by_its_path() -> None:
-    """Of messages and arrays; NaN beyond the end of an array."""
+    """In messages and arrays; NaN beyond the end of an array."""
     message = scan(10)
     assert number(message, 'ranges[7]') == 7.0
     assert number(message, 'angle_min') == 0.5
@@ -60,6 +60,6 @@ def test_a_number_is_found_by_its_path() -> None:
     '[0]', '.angle_min', 'ranges[-1]', 'ranges[0', 'ranges[99999999]', 'angle_min ', 'a.' * 200 + 'b', 'header[0]',
 ])  # fmt: skip
 def test_a_path_to_no_number_is_rejected(path: str) -> None:
-    """Attributes that are not fields of the message are none."""
+    """Attributes that are not message fields do not count."""
     with pytest.raises(Rejected):
         number(scan(10), path)

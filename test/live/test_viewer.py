@@ -1,4 +1,4 @@
-"""What one browser gets: the newest, small things first, and never more than it acknowledges."""
+"""The data sent to one browser: the newest, small items first, and never more than it acknowledges."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from shadowhound_data_logger.live.viewer import (
 
 
 class Browser:
-    """The other end: puts frames together, and acknowledges when it is told to."""
+    """The receiving end: assembles frames, and acknowledges when the test says so."""
 
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
@@ -39,7 +39,7 @@ class Browser:
         return self._frames.bytes
 
     def read(self, most: int = 10_000) -> list[dict[str, Any]]:
-        """What comes until nothing more may be sent."""
+        """Everything sent until the window is full."""
         before = len(self.items)
         while most and (frame := self.viewer.next_frame()) is not None:
             most -= 1
@@ -61,7 +61,7 @@ def row(number: int, topic: str = '/imu') -> LiveItem:
 
 @pytest.fixture
 def now() -> list[float]:
-    """A clock that tests turn."""
+    """A clock that tests advance."""
     return [0.0]
 
 
@@ -71,7 +71,7 @@ def browser(now: list[float]) -> Browser:
 
 
 def all_of(browser: Browser) -> list[dict[str, Any]]:
-    """What comes to a browser that acknowledges everything."""
+    """Everything sent to a browser that acknowledges all of it."""
     found: list[dict[str, Any]] = []
     while True:
         before = browser.received
@@ -82,14 +82,14 @@ def all_of(browser: Browser) -> list[dict[str, Any]]:
 
 
 def test_an_item_arrives_unchanged(browser: Browser) -> None:
-    """Its head and its body, whatever was cut into frames."""
+    """Its head and its body, however it was split into frames."""
     browser.viewer.offer(frame(7))
     (item,) = all_of(browser)
     assert (item['topic'], item['kind'], item['number'], item['body']) == ('/camera', 'camera', 7, bytes([7]) * 100_000)
 
 
 def test_a_browser_that_reads_nothing_is_sent_a_window_and_holds_one_item_a_topic(browser: Browser) -> None:
-    """However much comes: what is under way, the item that was begun, and the newest one."""
+    """However many items there are: those in flight, the one that was started, and the newest one."""
     for number in range(500):
         browser.viewer.offer(frame(number))
         browser.viewer.offer(row(number))
@@ -106,7 +106,7 @@ def test_a_browser_that_reads_nothing_is_sent_a_window_and_holds_one_item_a_topi
 
 
 def test_small_items_are_sent_before_the_rest_of_a_large_one(browser: Browser) -> None:
-    """A row that comes while a frame is under way is in the next frame of the WebSocket."""
+    """A row that arrives while a frame is being sent is in the next WebSocket frame."""
     browser.viewer.offer(frame(1))
     assert browser.read(2) == []
     browser.viewer.offer(row(1))
@@ -114,7 +114,7 @@ def test_small_items_are_sent_before_the_rest_of_a_large_one(browser: Browser) -
 
 
 def test_small_items_are_sent_together(browser: Browser) -> None:
-    """In one frame, of each topic in turn, as long as it is small; the rest in the next."""
+    """In one frame, one of each topic in turn, up to a size; the rest in the next."""
     for number in range(3):
         for topic in ('/imu', '/odom'):
             browser.viewer.offer(row(number, topic))
@@ -129,7 +129,7 @@ def test_small_items_are_sent_together(browser: Browser) -> None:
 
 
 def test_bulk_topics_share_a_link_by_weight(browser: Browser) -> None:
-    """A cloud in between costs a camera a fifth, not a half; one that was silent has no claim on what it did not use."""
+    """A cloud in between costs a camera a fifth, not a half; a topic that was silent does not accumulate a share."""
     for number in range(50):
         browser.viewer.offer(frame(number, 20_000))
         all_of(browser)
@@ -144,7 +144,7 @@ def test_bulk_topics_share_a_link_by_weight(browser: Browser) -> None:
 
 
 def test_a_slow_link_gets_smaller_pictures_and_a_better_one_larger_again(browser: Browser, now: list[float]) -> None:
-    """The size follows what the browser acknowledges."""
+    """The size follows the browser's acknowledgments."""
     viewer = browser.viewer
 
     def through(bytes_per_s: float, seconds: float) -> None:
@@ -170,7 +170,7 @@ def test_a_slow_link_gets_smaller_pictures_and_a_better_one_larger_again(browser
 
 @pytest.mark.parametrize('said', [0, 1, 0xFFFF_FFFF, 0x8000_0000])
 def test_an_acknowledgement_of_what_was_not_sent_opens_no_window(browser: Browser, said: int) -> None:
-    """A browser that lies gets no more than one that is silent."""
+    """A browser with false acknowledgments gets no more than a silent one."""
     browser.viewer.offer(frame(1, 400_000))
     browser.read()
     before = browser.received
@@ -180,7 +180,7 @@ def test_an_acknowledgement_of_what_was_not_sent_opens_no_window(browser: Browse
 
 
 def test_topics_that_are_no_longer_watched_are_not_sent(browser: Browser) -> None:
-    """A hidden tab watches nothing, and gets at most what was begun."""
+    """A hidden tab watches nothing, and gets at most the item already started."""
     browser.viewer.watch(['/camera', '/imu'])
     browser.viewer.offer(row(1))
     browser.viewer.offer(frame(1))
@@ -189,7 +189,7 @@ def test_topics_that_are_no_longer_watched_are_not_sent(browser: Browser) -> Non
 
 
 class Link:
-    """Carries what a viewer is sent at a rate, after which an acknowledgement takes the rest of a round. Times are in s."""
+    """Carries a viewer's data at a rate; an acknowledgment takes the rest of the round trip. Times are in s."""
 
     def __init__(self, viewer: Viewer, now: list[float], rate: float, round_s: float) -> None:
         self.viewer, self.now, self.rate, self.round_s = viewer, now, rate, round_s
@@ -200,7 +200,7 @@ class Link:
         self.late_s: list[float] = []
 
     def run(self, seconds: float, camera_bytes: int = 60_000, camera_hz: float = 30.0) -> None:
-        """A camera, and rows at 100 Hz, each of which says when it was offered."""
+        """A camera, and rows at 100 Hz, each with the time at which it was offered."""
         camera_s = row_s = self.now[0]
         sizes_s, end_s = self.now[0] + 1, self.now[0] + seconds
         while self.now[0] < end_s:
@@ -228,7 +228,7 @@ class Link:
 
 @pytest.mark.parametrize('round_s', [0.0, 0.02, 0.1, 0.25])
 def test_a_link_with_a_long_round_trip_is_filled(now: list[float], round_s: float) -> None:
-    """However far the robot is, a link that carries everything does: in full size, and small items are as late as the way is."""
+    """At any distance, a link with enough bandwidth carries full size, and small items are only delayed by the latency."""
     viewer = Viewer(lambda: now[0])
     viewer.round_s = round_s
     link = Link(viewer, now, 4e6, round_s)
@@ -245,7 +245,7 @@ def test_a_link_with_a_long_round_trip_is_filled(now: list[float], round_s: floa
 @pytest.mark.parametrize('round_s', [0.0, 0.1])
 @pytest.mark.parametrize('rate', [60_000.0, 250_000.0, 1e6])
 def test_a_narrow_link_is_not_filled_beyond_what_it_holds(now: list[float], rate: float, round_s: float) -> None:
-    """Nor is a far one taken for a faster one: a row is late by the way and by what may wait on it."""
+    """Nor is a distant one taken for a faster one: a row is delayed by the latency and by what may be in flight."""
     viewer = Viewer(lambda: now[0])
     viewer.round_s = round_s
     link = Link(viewer, now, rate, round_s)
@@ -258,14 +258,14 @@ def test_a_narrow_link_is_not_filled_beyond_what_it_holds(now: list[float], rate
 
 
 def test_with_video_large_items_get_a_share_of_the_link(now: list[float]) -> None:
-    """Of the link as it was before: what goes beside video tells nothing of it. Rows wait for no more than that part of a way."""
+    """Of the link as it was before: traffic next to video is no measure of it. Rows only wait for that part of the latency."""
     viewer = Viewer(lambda: now[0])
     viewer.round_s = 0.1
     link = Link(viewer, now, 2e6, 0.1)
     link.run(5.0)
     before = viewer.window
     viewer.has_video, rate = True, viewer.rate
-    link.rate = 125_000.0  # video has the rest
+    link.rate = 125_000.0  # video uses the rest
     link.run(2.0)
     link.carried = 0
     link.late_s.clear()
@@ -282,7 +282,7 @@ def test_with_video_large_items_get_a_share_of_the_link(now: list[float]) -> Non
 
 @pytest.mark.parametrize(('rate', 'chunk'), [(5e6, MAX_CHUNK), (60_000.0, MIN_CHUNK), (FIRST_RATE, int(FIRST_RATE * CHUNK_S))])
 def test_a_piece_of_a_large_item_does_not_keep_a_link_for_long(browser: Browser, rate: float, chunk: int) -> None:
-    """What comes after it waits 13 ms, where the link is not slower than is worth while."""
+    """The next item waits 13 ms, unless the link is slower than the supported minimum."""
     browser.viewer.rate = rate
     browser.viewer.offer(frame(1))
     sent = browser.viewer.next_frame()
@@ -291,7 +291,7 @@ def test_a_piece_of_a_large_item_does_not_keep_a_link_for_long(browser: Browser,
 
 
 def test_with_video_frames_of_large_items_are_sized_by_their_share(browser: Browser) -> None:
-    """Not as the whole link: rows and video would wait for it."""
+    """Not for the full link: rows and video would wait for it."""
     browser.viewer.rate, browser.viewer.has_video = 4e6, True
     browser.viewer.offer(frame(1))
     sent = browser.viewer.next_frame()
@@ -300,7 +300,7 @@ def test_with_video_frames_of_large_items_are_sized_by_their_share(browser: Brow
 
 
 def test_small_items_are_sent_while_a_window_is_full(browser: Browser) -> None:
-    """They do not wait until a large one is acknowledged; for who acknowledges nothing, that ends."""
+    """They do not wait until a large one is acknowledged; for a browser that acknowledges nothing, that ends."""
     browser.viewer.offer(frame(1, 400_000))
     browser.read()
     before = browser.received
@@ -313,7 +313,7 @@ def test_small_items_are_sent_while_a_window_is_full(browser: Browser) -> None:
 
 
 def test_an_implausible_link_rate_is_not_trusted(now: list[float]) -> None:
-    """A kernel, or who stands in between, may say anything."""
+    """A kernel, or an intermediary, may report any value."""
     viewer = Viewer(lambda: now[0])
     viewer.rate, viewer.round_s = 1e12, 1e6
     assert viewer.window <= MAX_QUEUE + MAX_RATE * MAX_ROUND_S

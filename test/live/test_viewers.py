@@ -1,4 +1,4 @@
-"""How packets of the live page are marked, read off the wire: as interactive video (DSCP AF41)."""
+"""The packet marks of the live page, as captured: interactive video (DSCP AF41)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def needs_ipv6() -> None:
 
 @pytest.fixture
 def wire() -> Iterator[socket.socket]:
-    """All packets on the loopback, from the IP header on."""
+    """All packets on the loopback, starting with the IP header."""
     try:
         packets = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(EVERY_PROTOCOL))
     except PermissionError:
@@ -41,7 +41,7 @@ def wire() -> Iterator[socket.socket]:
 
 
 def marks(wire: socket.socket, port: int, content: bytes) -> set[int]:
-    """Of the packets so far that come from that port and have this in them."""
+    """The marks of the packets so far that come from that port and contain this."""
     found = set()
     while True:
         try:
@@ -58,7 +58,7 @@ def marks(wire: socket.socket, port: int, content: bytes) -> set[int]:
 def test_packets_to_a_viewer_are_marked_as_video(
     bind: str, host: str, wire: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By IPv4 and IPv6, and by IPv4 at a socket of IPv6, which has a mark for each."""
+    """With IPv4, IPv6, and IPv4 on an IPv6 socket, which has a separate mark for each."""
     if ':' in bind:
         needs_ipv6()
 
@@ -82,7 +82,7 @@ def test_packets_to_a_viewer_are_marked_as_video(
     ('::1', socket.AF_INET6, (socket.IPPROTO_IPV6, socket.IPV6_RECVTCLASS)),
 ])  # fmt: skip
 def test_webrtc_packets_are_marked_as_video(address: str, family: int, asked: tuple[int, int]) -> None:
-    """Over WebRTC, by IPv4 and by IPv6."""
+    """With IPv4 and IPv6."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     aioice = pytest.importorskip('aioice')
     if family == socket.AF_INET6:

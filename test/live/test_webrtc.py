@@ -1,4 +1,4 @@
-"""The camera as video over WebRTC, to a real Chromium and to receivers of aiortc: from a server with frames of our own."""
+"""The camera as video over WebRTC, to a real Chromium and to receivers of aiortc: from a server with generated frames."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ a=rtpmap:96 VP8/90000
 
 
 def picture(number: int) -> bytes:
-    """320 x 240, of which the brightness tells which one it is."""
+    """320 x 240, with the index as its brightness."""
     return bytes(
         simplejpeg.encode_jpeg(np.full((240, 320, 3), 20 + 18 * (number % LEVELS), np.uint8), 90, colorsubsampling='420')
     )
@@ -62,12 +62,12 @@ async def until(condition: Callable[[], Awaitable[Any]], what: str) -> Any:
 
 
 class Robot:
-    """A page with a camera of ten frames a second."""
+    """A page with a camera of ten frames per second."""
 
     def __init__(self, page: Page) -> None:
         self.page, self.server = page, page.server
         self.at: list[float] = []
-        """When each frame came, ms."""
+        """The arrival time of each frame, ms."""
 
     async def publish(self) -> None:
         while True:
@@ -93,13 +93,13 @@ async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is encoded once for both; each frame has the time at which it came to the robot; JPEGs are not sent beside it.
+    """It is encoded once for both; each frame has its time of arrival at the robot; JPEGs are not sent in addition.
 
-    When a viewer goes back to JPEG it gets those, and without viewers nothing is encoded.
+    When a viewer switches back to JPEG it gets those, and without viewers nothing is encoded.
     """
     api = pytest.importorskip('playwright.async_api')
     pytest.importorskip('aiortc')
-    # What is on the canvas and when the page says that it came.
+    # The contents of the canvas and the time that the page shows for it.
     shown = """() => [document.querySelector('.camera canvas').getContext('2d').getImageData(160, 120, 1, 1).data[1],
                       shadowhound.at().camera, shadowhound.video.frames]"""
 
@@ -125,7 +125,7 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
                 told = [await tab.evaluate(shown) for _ in range(20)]
                 for level, at, _ in told:
                     number = min(range(len(found.at)), key=lambda place: abs(found.at[place] - at))
-                    assert abs(found.at[number] - at) < 1, 'a time at which no frame came'
+                    assert abs(found.at[number] - at) < 1, 'no frame arrived at this time'
                     assert abs(level - (20 + 18 * (number % LEVELS))) < 9, 'the time is that of another frame'
             await tabs[0].select_option('[data-video]', 'jpeg')
             await until(lambda: tabs[0].evaluate("document.querySelector('[data-video]').dataset.video === 'off'"), 'JPEG again')
@@ -144,7 +144,7 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_without_the_extra_the_page_shows_jpegs_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the extra is there and the negotiation fails."""
+    """Also if the extra is installed and the negotiation fails."""
     api = pytest.importorskip('playwright.async_api')
 
     async def run() -> None:
@@ -170,7 +170,7 @@ def test_without_the_extra_the_page_shows_jpegs_and_why(tmp_path: Path, monkeypa
 
 
 class Receiver:
-    """A viewer without a browser, which takes one codec. aiortc gives a frame when the next one begins to arrive."""
+    """A viewer without a browser, with one codec. aiortc returns a frame when the next one starts to arrive."""
 
     def __init__(self, video: Any, *codecs: str) -> None:
         import aiortc
@@ -178,12 +178,12 @@ class Receiver:
         self.video, self.codecs = video, codecs
         self.told: list[dict[str, Any]] = []
         self.seen: list[tuple[float, int]] = []
-        """When frames came to the robot, ms, and how bright they are."""
+        """When frames arrived at the robot, ms, and their brightness."""
         self.pc = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
         self._task: asyncio.Task[None] | None = None
 
     async def ask(self) -> dict[str, Any]:
-        """For the camera; what is told at once."""
+        """Request the camera; returns the immediate response."""
         import aiortc
 
         from shadowhound_data_logger.live.webrtc import _gather_at
@@ -222,7 +222,7 @@ class Receiver:
 
 @asynccontextmanager
 async def encoded() -> AsyncIterator[tuple[Any, list[float]]]:
-    """The video of a camera of ten frames a second, and when each came, ms."""
+    """The video of a camera of ten frames per second, and when each arrived, ms."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     video = webrtc.CameraVideo(lambda: None)
     at: list[float] = []
@@ -246,12 +246,12 @@ async def encoded() -> AsyncIterator[tuple[Any, list[float]]]:
 def assert_is_of_its_time(seen: list[tuple[float, int]], at: list[float]) -> None:
     for at_ms, level in seen:
         number = min(range(len(at)), key=lambda place: abs(at[place] - at_ms))
-        assert abs(at[number] - at_ms) < 0.5, 'a time at which no frame came'
+        assert abs(at[number] - at_ms) < 0.5, 'no frame arrived at this time'
         assert abs(level - (20 + 18 * (number % LEVELS))) < 9, 'the time is that of another frame'
 
 
 def test_viewers_share_an_encoder_and_one_without_its_codec_is_refused() -> None:
-    """Each frame has the time at which it arrived at the robot; the last viewer to leave ends the encoder."""
+    """Each frame has the time at which it arrived at the robot; when the last viewer leaves the encoder stops."""
 
     async def run() -> None:
         async with encoded() as (video, at):
@@ -276,7 +276,7 @@ def test_viewers_share_an_encoder_and_one_without_its_codec_is_refused() -> None
 
 @pytest.mark.parametrize('end', ['\n', '\r\n', '\r', '\x0b', '\x0c', '\x85', '\u2028'])
 def test_an_offer_gives_ports_and_no_addresses(end: str) -> None:
-    """Whatever an offer names, packets go to the viewer's own address alone; aiortc ends lines in many ways."""
+    """Whatever an offer contains, packets are only sent to the viewer's address; aiortc ends lines in many ways."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     offer = OFFER.replace('\na=candidate', f'{end}a=candidate')
     found = [line for line in webrtc._with_address(offer, '192.0.2.7').splitlines() if 'candidate:' in line]
@@ -289,7 +289,7 @@ def test_an_offer_gives_ports_and_no_addresses(end: str) -> None:
     'm=video \ud800', OFFER.replace('a=setup:actpass', 'a=setup:nobody'), 7, None, ['m=video 9'],
 ])  # fmt: skip
 def test_an_invalid_offer_is_answered_with_the_problem(offer: Any) -> None:
-    """And leaves nothing behind."""
+    """And has no lasting effect."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
 
     async def run() -> None:
@@ -306,7 +306,7 @@ def test_an_invalid_offer_is_answered_with_the_problem(offer: Any) -> None:
 
 
 def test_peers_and_cameras_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever comes later is told so; whoever goes makes room."""
+    """A viewer above the limit gets an error; one that leaves makes room."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     monkeypatch.setattr(webrtc, 'MAX_PEERS', 3)
     addresses = '127.0.0.1', '::ffff:127.0.0.1'
@@ -333,7 +333,7 @@ def test_peers_and_cameras_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_frames_of_any_size_become_video() -> None:
-    """Odd sides, large ones, gray ones; what is no picture is left out."""
+    """Odd sides, large ones, gray ones; invalid images are skipped."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     for height, width, shown in ((3, 5, (2, 4)), (240, 321, (240, 320)), (500, 4001, (188, 1500))):
         frame = webrtc._frame(simplejpeg.encode_jpeg(np.zeros((height, width, 3), np.uint8)))

@@ -1,4 +1,4 @@
-"""A real MLflow server behind a wire that can be cut, and what is in it."""
+"""A real MLflow server behind a wire that can be cut, and its contents."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shadowhound_data_logger.missions.folder import MISSIONS, read_json
 
 @pytest.fixture
 def server(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    """The session's Tower, its MLflow behind a wire of this test's own, as the environment of the logger."""
+    """The session's Tower, its MLflow behind a separate wire for this test, as the environment of the logger."""
     for name in [name for name in os.environ if name.startswith(FOREIGN)]:
         monkeypatch.delenv(name)
     with Wire(tower.tracking_uri) as wire:
@@ -29,7 +29,7 @@ def server(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
 
 @pytest.fixture(scope='session')
 def warm_home(tower: Tower, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A home whose sender is there and has loaded MLflow, for all tests that do nothing to it; straight to Tower."""
+    """A home with a running sender that has loaded MLflow, for all tests that do nothing to it; without a wire."""
     home = tmp_path_factory.mktemp('warm')
     with pytest.MonkeyPatch.context() as patched:
         for name in [name for name in os.environ if name.startswith(FOREIGN)]:
@@ -46,6 +46,6 @@ def warm_home(tower: Tower, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 @pytest.fixture
 def home(tmp_path: Path) -> Iterator[Path]:
-    """Of the logger; what sends its missions ends with the test."""
+    """The logger's home; its sender stops with the test."""
     yield tmp_path / 'home'
     end_replayers(tmp_path / 'home')

@@ -39,7 +39,7 @@ def complete(home: Path, count: int = 1) -> bool:
 
 
 def end_replayers(home: Path) -> None:
-    """Kill the replayer of a home that a test leaves behind."""
+    """Kill the replayer of a home that a test leaves running."""
     pid = read_json(home / MISSIONS / 'replay.json').get('pid')
     if pid and Path(f'/proc/{pid}').exists() and str(home) in Path(f'/proc/{pid}/cmdline').read_text():
         os.kill(pid, signal.SIGKILL)
@@ -54,7 +54,7 @@ class Server:
 
     @cached_property
     def client(self) -> Any:
-        """Not through the wire."""
+        """Without the wire."""
         os.environ |= ENVIRONMENT
         from mlflow import MlflowClient
 
@@ -68,7 +68,7 @@ class Server:
         return list(self.client.search_runs([experiment.experiment_id], f"params.mission_command = '{command}'"))
 
     def run(self, command: str) -> Any:
-        """The one run."""
+        """The only run."""
         (found,) = self.runs(command)
         return found
 

@@ -15,7 +15,7 @@ from shadowhound_data_logger.missions.folder import new_folder
 
 
 def test_a_mission_is_active_from_start_to_end(tmp_path: Path) -> None:
-    """It is found by its journal's lock; its end's time is the one that the agent recorded."""
+    """It is found by its journal's lock; the time of its end is the one that the agent recorded."""
     finder = MissionFinder(tmp_path, 'thor')
     assert finder.active() is None
     with journalling(tmp_path) as logger:
@@ -26,7 +26,7 @@ def test_a_mission_is_active_from_start_to_end(tmp_path: Path) -> None:
             mission_id, 'patrol', True, False,
         )  # fmt: skip
         logger.end_mission(True, 1.0, 1.0)
-        until(lambda: finder.active() is None, 'the end of the mission')  # the journal is let go of by another thread
+        until(lambda: finder.active() is None, 'the end of the mission')  # another thread releases the journal
     over = ended(found)
     assert over.end_ns == (journal.last(found.folder.journal))['t']
     assert over.has(over.end_ns or 0)
@@ -42,7 +42,7 @@ def test_only_missions_of_the_same_robot_are_found(tmp_path: Path) -> None:
 
 
 def test_the_newest_of_several_is_active(tmp_path: Path) -> None:
-    """When it ends, the one before it is again."""
+    """When it ends, the previous one is active again."""
     finder = MissionFinder(tmp_path, 'thor')
     with journalling(tmp_path) as first:
         older = first.start_mission('z', '')

@@ -40,7 +40,7 @@ CHANGED = {
 }  # fmt: skip
 FOLDERS = {"it's": 'it=27s', '..dots': '=2E.dots', '...': '=2E..', 'a/..b/c#': 'a/=2E.b/c=23', 'maps': 'maps'}
 LONG = ('x' * 251 + '.txt', 'x' * 250 + 'y.txt', '巡' * 85, '探' * 85, '#' * 254 + 'a', '#' * 254 + 'b')
-"""255 bytes, and more where odd letters are changed."""
+"""255 bytes, and more if unusual characters are replaced."""
 
 
 def original(name: str) -> str:
@@ -50,7 +50,7 @@ def original(name: str) -> str:
 
 
 def test_names_that_mlflow_allows_are_kept_and_others_changed() -> None:
-    """As docs/missions.md says."""
+    """As docs/missions.md documents."""
     assert [artifact_name(name) for name in KEPT] == list(KEPT)
     assert {name: artifact_name(name) for name in CHANGED} == CHANGED
     assert {name: artifact_folder(name) for name in FOLDERS} == FOLDERS
@@ -93,7 +93,7 @@ def files(folder: Path, names: list[str]) -> Iterator[Path]:
 
 
 def log_all(logger: MissionDataLogger, folder: Path) -> dict[str, bytes]:
-    """All names, at the root and in an odd folder, and all folders; what the run must have then."""
+    """All names, at the root and in a folder with an unusual name, and all folders; returns what the run must have."""
     names, expected = [*KEPT, *CHANGED, *LONG], {}
     for path in files(folder, names):
         for where in (None, 'odd #1'):
@@ -116,7 +116,7 @@ def without_ours(found: dict[str, bytes]) -> dict[str, bytes]:
 @pytest.mark.seaweedfs
 @pytest.mark.long('two hundred uploads')
 def test_every_name_reaches_the_run_through_the_server(server: Server, warm_home: Path, tmp_path: Path) -> None:
-    """Listed and downloaded by MLflow's client and by what its page asks for; the summary has the names that were changed."""
+    """Listed and downloaded by MLflow's client and by the requests of its page; the summary has the names that were changed."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     run_id = logger.start_mission('patrol', 'odd names')
     expected = log_all(logger, tmp_path)
@@ -219,7 +219,7 @@ def test_refused_artifacts_are_counted_with_their_reason(folder: MissionFolder) 
 
 @pytest.mark.parametrize('error', [TrackingUnavailable('500 for bad', remedy=''), OSError(5, 'Input/output error')])
 def test_an_artifact_that_fails_delays_no_other(folder: MissionFolder, error: Exception) -> None:
-    """A server's own error, a broken connection or disk: all others arrive, and it is tried again until it does too."""
+    """A server's error, a broken connection or disk: all others arrive, and it is retried until it does too."""
     broken = True
     tracking = Picky(lambda name: name != 'bad' or not broken, lambda: error)
     delivery = Delivery(folder, tracking, FakeSpooler())  # type: ignore[arg-type]
@@ -262,7 +262,7 @@ def test_a_restart_in_between_loses_nothing(folder: MissionFolder) -> None:
 @pytest.mark.seaweedfs
 @pytest.mark.long('waits for what does not come')
 def test_an_artifact_with_the_name_of_a_folder_is_renamed(server: Server, warm_home: Path, tmp_path: Path) -> None:
-    """Where the server cannot hold both, the rest of the mission is there, and the report names the one that is not."""
+    """If the server cannot hold both, the rest of the mission is there, and the report names the missing one."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     run_id = logger.start_mission('patrol', 'a clash')
     for name, where in (('clash', None), ('in.txt', 'clash'), ('plain.txt', None)):
@@ -277,7 +277,7 @@ def test_an_artifact_with_the_name_of_a_folder_is_renamed(server: Server, warm_h
 
 
 def test_an_s3_server_s_answer_is_recognized(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """boto3 hides it in what its own error was raised for."""
+    """boto3 hides it in the cause of its error."""
     from boto3.exceptions import S3UploadFailedError
     from botocore.exceptions import ClientError
 

@@ -33,7 +33,7 @@ def home(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def host(tmp_path: Path) -> Path:
-    """A program that embeds Python, and records each time it is started."""
+    """A program that embeds Python, and records each start."""
     return program(tmp_path / 'bin/my_robot_app', tmp_path / 'started')
 
 
@@ -54,7 +54,7 @@ def nowhere(patched: pytest.MonkeyPatch, folder: Path) -> None:
 
 @pytest.mark.parametrize('executable', [None, '', 'host', 'python3', '/nowhere/python3', 3, '/', '/etc/passwd'])
 def test_an_embedded_python_finds_its_interpreter(host: Path, monkeypatch: pytest.MonkeyPatch, executable: Any) -> None:
-    """By where Python itself is installed; the host program is not taken for one."""
+    """From the location of Python's installation; the host program is not used instead."""
     monkeypatch.setattr(sys, 'executable', str(host) if executable == 'host' else executable)
     monkeypatch.setattr(sys, '_base_executable', str(host), raising=False)
     found = interpreter()
@@ -64,7 +64,7 @@ def test_an_embedded_python_finds_its_interpreter(host: Path, monkeypatch: pytes
 
 
 def test_a_frozen_program_has_no_interpreter(host: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though it may be called python3, itself or by a link, or have an interpreter of another version next to it."""
+    """Though it may be called python3, directly or by a link, or have an interpreter of another version next to it."""
     nowhere(monkeypatch, tmp_path)
     monkeypatch.setattr(sys, 'executable', str(host))
     assert interpreter() is None
@@ -131,7 +131,7 @@ def is_holding(pid: int) -> bool:
 
 @pytest.mark.parametrize('by', ['wake', 'release', 'LOAD_DELAY_S'])
 def test_the_sender_loads_nothing_until_it_is_woken(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str) -> None:
-    """Or its agent is gone, or a second has passed: the CPU is left to the first mission's request for a run."""
+    """Or its agent is gone, or a second has passed: the CPU is reserved for the first mission's request for a run."""
     fake, loaded = tmp_path / 'package/shadowhound_data_logger/missions', tmp_path / 'loaded'
     fake.mkdir(parents=True)
     for folder in (fake, fake.parent):

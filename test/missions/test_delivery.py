@@ -59,7 +59,7 @@ def names(tracking: FakeTracking) -> list[str]:
 
 
 def test_everything_arrives_in_order(tmp_path: Path) -> None:
-    """Params, points with their own times, artifacts, objects and the end."""
+    """Params, points with their times, artifacts, objects and the end."""
     folder = fly(tmp_path)
     journal = [line.record or {} for line in read(folder.journal)]
     tracking, spooler = FakeTracking(), FakeSpooler()
@@ -87,7 +87,7 @@ def test_everything_arrives_in_order(tmp_path: Path) -> None:
 
 
 def test_the_summary_describes_the_mission(tmp_path: Path) -> None:
-    """Its times, result, errors, counts and where its data are; the same in the run and in the store."""
+    """Its times, result, errors, counts and the location of its data; the same in the run and in the store."""
     folder = fly(tmp_path)
     tracking, spooler = FakeTracking(), FakeSpooler()
     deliver(folder, tracking, spooler)
@@ -131,7 +131,7 @@ MORE = (pytest.param(seed, marks=pytest.mark.long('more of the same')) for seed 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('seed', [*range(SOME), *MORE])
 def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
-    """Requests and answers get lost, the replayer dies in between: afterwards all has arrived, effectively exactly once."""
+    """Requests and responses get lost, the replayer is killed: at the end all has arrived, effectively exactly once."""
     rng = random.Random(seed)
     folder = fly(tmp_path, points=1200, frames=9)
     tracking = FakeTracking(fail=lambda _: rng.random() < 0.3)
@@ -158,7 +158,7 @@ def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
 
 
 def test_the_run_is_looked_up_after_a_lost_answer(tmp_path: Path) -> None:
-    """A run that was made although the answer got lost is the mission's, and no second one is made."""
+    """A run that was created although the response got lost is used, and no second one is created."""
     folder, answers = fly(tmp_path), iter([False, True])
     tracking = FakeTracking(fail=lambda _: next(answers, False))
     delivery = Delivery(folder, tracking, FakeSpooler())  # type: ignore[arg-type]
@@ -189,7 +189,7 @@ def test_a_deleted_run_is_not_created_again(tmp_path: Path) -> None:
 
 
 def test_artifacts_that_fail_delay_no_metric(tmp_path: Path) -> None:
-    """The run is whole and ended while its artifacts wait, and the mission is not complete."""
+    """The run is complete and ended while its artifacts wait, and the mission is not complete."""
     folder = fly(tmp_path)
     tracking = FakeTracking(fail=lambda name: name == 'artifact')
     spooler = FakeSpooler()
@@ -210,7 +210,7 @@ def test_artifacts_that_fail_delay_no_metric(tmp_path: Path) -> None:
 
 
 def abandon(home: Path) -> MissionFolder:
-    """A mission whose agent dies in the middle of writing a record."""
+    """A mission with an agent that is killed while it writes a record."""
     folder = fly(home, points=5)
     lines = folder.journal.read_bytes().splitlines(keepends=True)
     folder.journal.write_bytes(b''.join(lines[:-1]) + b'0000 {"torn')
@@ -218,7 +218,7 @@ def abandon(home: Path) -> MissionFolder:
 
 
 def test_a_mission_of_a_dead_agent_ends_as_killed(tmp_path: Path) -> None:
-    """It ends at its last record, with its last known state, and what was torn is cut off."""
+    """It ends at its last record, with its last known state, and the torn record is removed."""
     folder = abandon(tmp_path)
     last_ns = [line.record['t'] for line in read(folder.journal) if line.record][-1]
     tracking, spooler = FakeTracking(), FakeSpooler()
@@ -273,7 +273,7 @@ def test_a_measured_distance_replaces_a_stated_zero(tmp_path: Path) -> None:
 
 
 def test_a_missing_frame_is_counted(tmp_path: Path) -> None:
-    """In the report, in the summary's ledger, and nowhere as an object; what is not gone arrives."""
+    """In the report, in the summary's ledger, and nowhere as an object; existing frames arrive."""
     folder = fly(tmp_path, frames=3)
     [gone] = (file for file in folder.files.iterdir() if file.read_bytes() == JPEG + bytes([1]))
     gone.unlink()

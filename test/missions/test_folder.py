@@ -1,4 +1,4 @@
-"""Missions of a robot that starts in 1970 and learns the time later, or never: all their records have the same, correct date."""
+"""Missions of a robot that starts in 1970 and gets the time later, or never: all their records have the same, correct date."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from shadowhound_data_logger.missions.replay import Replay
 
 MS = 1_000_000
 NAME = 'patrol_20251018_115950'
-"""Of a run that began ten seconds before noon."""
+"""The start of a run ten seconds before noon."""
 
 
 @pytest.fixture
 def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
-    """Of this machine."""
+    """The clocks of this machine."""
     found = Clocks()
     monkeypatch.setattr(SystemClock, 'of_this_machine', lambda: found)
     return found
@@ -107,7 +107,7 @@ def test_a_mission_is_dated_when_the_clock_is_set_during_it(tmp_path: Path, cloc
 
 
 def test_a_date_is_given_once(tmp_path: Path, clocks: Clocks) -> None:
-    """A clock that is corrected later changes no time of a mission that is half sent: no point comes twice."""
+    """A clock that is corrected later changes no time of a mission that is partially sent: no point is sent twice."""
     fly(tmp_path, clocks)
     clocks.set(NOON_NS)
     away = FakeTracking(fail=lambda name: name == 'finish')
@@ -140,7 +140,7 @@ def test_a_mission_of_an_earlier_boot_is_dated_by_its_offset(tmp_path: Path, clo
 
 
 def test_a_mission_is_sent_without_a_date_when_the_clock_is_never_set(tmp_path: Path, clocks: Clocks) -> None:
-    """After ``clock.hold_s`` the mission is sent with the times that it has."""
+    """After ``clock.hold_s`` the mission is sent with its recorded times."""
     fly(tmp_path, clocks)
     tracking = FakeTracking()
     replay = sender(tmp_path, clocks, tracking, FakeSpooler())
@@ -153,7 +153,7 @@ def test_a_mission_is_sent_without_a_date_when_the_clock_is_never_set(tmp_path: 
 
 
 def test_the_nodes_journal_is_dated_as_well(tmp_path: Path, clocks: Clocks) -> None:
-    """Poses of before and after the clock was set are one path, and steps are seconds since the start all the way."""
+    """Poses from before and after the clock was set are one path, and steps are seconds since the start throughout."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         found = MissionFinder(tmp_path, 'thor').active()

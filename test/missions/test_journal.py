@@ -105,7 +105,7 @@ def test_a_running_writer_is_detected(journal: Journal) -> None:
 
 
 def test_an_exited_writer_is_detected_whatever_it_forked(tmp_path: Path) -> None:
-    """A killed writer's lock is free although a process that it forked lives on."""
+    """A killed writer's lock is free although a process that it forked is still running."""
     program = """
 import os, signal, sys
 from pathlib import Path
@@ -136,7 +136,7 @@ signal.pause()
 
 
 def test_the_last_record_replaces_a_torn_one(journal: Journal) -> None:
-    """Finishing cuts half a record off and says how much that was."""
+    """Finishing removes a partial record and returns its size."""
     journal.append({'a': 1})
     end = journal.path.stat().st_size
     with journal.path.open('ab') as file:

@@ -1,4 +1,4 @@
-"""What the node logged arrives in the agent's run: once, before the end, and behind what the agent states itself."""
+"""The node's records arrive in the agent's run: once, before the end, and older than the agent's statements."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ JPEG = b'\xff\xd8 of the node \xff\xd9'
 
 
 def join(home: Path, *, seconds: int = 5, step_ns: int = 1000) -> NodeLog:
-    """A node that has seen a robot for a while."""
+    """A node that has observed a robot for a while."""
     mission = MissionFinder(home, 'thor').active()
     assert mission
     node_log = NodeLog(mission, step_ns, 5e9)
@@ -44,7 +44,7 @@ def work(delivery: Delivery) -> bool:
 
 
 def deliver(folder: MissionFolder, tracking: FakeTracking, spooler: FakeSpooler, rounds: int = 50) -> bool:
-    """Whether all of it arrives."""
+    """Whether everything arrives."""
     delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]
     return any(work(delivery) for _ in range(rounds))
 
@@ -55,7 +55,7 @@ def newest(tracking: FakeTracking) -> dict[str, float]:
 
 
 def flown(home: Path, distance_m: float = 0.0) -> ActiveMission:
-    """A mission whose agent only starts and ends."""
+    """A mission with an agent that only starts and ends it."""
     with journalling(home) as logger:
         logger.start_mission('patrol', 'go')
         node_log = join(home)
@@ -84,7 +84,7 @@ def test_an_agent_that_only_starts_and_ends_has_a_complete_run(tmp_path: Path) -
 
 
 def test_a_positive_stated_value_wins(tmp_path: Path) -> None:
-    """Where 0 is stated the measured value stands; the summary has both."""
+    """If 0 is stated the measured value is shown; the summary has both."""
     for stated, stands in ((0.0, 4.0), (7.0, 7.0)):
         mission, tracking = flown(tmp_path / str(stated), stated), FakeTracking()
         assert deliver(mission.folder, tracking, FakeSpooler())
@@ -95,7 +95,7 @@ def test_a_positive_stated_value_wins(tmp_path: Path) -> None:
 
 
 def test_the_end_waits_for_the_node(tmp_path: Path) -> None:
-    """The run is ended, and the mission complete, after the node let go of its journal."""
+    """The run is ended, and the mission complete, after the node released its journal."""
     tracking, spooler = FakeTracking(), FakeSpooler()
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -128,7 +128,7 @@ def test_a_hung_node_does_not_delay_the_end(tmp_path: Path) -> None:
 
 
 def test_the_agents_own_values_win(tmp_path: Path) -> None:
-    """Of a metric that both log the agent's is the newest; frames of both are kept, with separate numbers."""
+    """If both log a metric the agent's value is the newest; frames of both are kept, with separate numbers."""
     tracking, spooler = FakeTracking(), FakeSpooler()
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -148,7 +148,7 @@ def test_the_agents_own_values_win(tmp_path: Path) -> None:
 
 
 def test_the_mission_of_a_killed_agent_ends_with_the_nodes_last_record(tmp_path: Path) -> None:
-    """It is KILLED at the time up to which the node saw the robot."""
+    """It is KILLED at the time of the node's last record."""
     logger = MissionDataLogger(home=tmp_path, replay=False, start_timeout_s=0.0)
     logger.start_mission('patrol', '')
     node_log = join(tmp_path, seconds=4, step_ns=SECOND)
@@ -161,7 +161,7 @@ def test_the_mission_of_a_killed_agent_ends_with_the_nodes_last_record(tmp_path:
 
 
 def test_failures_change_nothing_of_the_nodes_part(tmp_path: Path) -> None:
-    """Requests and answers get lost and the sender dies in between: each point is there, and each object once."""
+    """Requests and responses get lost and the sender is killed in between: each point is there, and each object once."""
     for seed in range(6):
         rng = random.Random(seed)
         home = tmp_path / str(seed)

@@ -1,4 +1,4 @@
-"""A mission's type has one spelling, the agent's, everywhere but in keys and names of files."""
+"""A mission's type has one spelling, the agent's, everywhere except in keys and file names."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ SEEN = ('巡逻', '探索', 'night patrol')
 
 @pytest.mark.long('a sender that loads MLflow')
 def test_every_verb_has_the_agents_spelling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From start_mission to query, search, export and missions; a type that no mission has is an error with the nearest one."""
+    """From start_mission to query, search, export and missions; an unknown type is an error that suggests the nearest one."""
     for name in [name for name in os.environ if name.startswith(FOREIGN)]:
         monkeypatch.delenv(name)
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path / 'home'))

@@ -1,4 +1,4 @@
-"""The logger of an agent: its calls, its failures, its lifecycle, forks and closing."""
+"""The agent's logger: its calls, its failures, its lifecycle, forks and closing."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_failure_is_the_state_of_the_run(tmp_path: Path) -> None:
 
 
 def test_without_a_mission_calls_warn_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The agent may call whenever it likes; each kind of call is warned of once."""
+    """The agent may call at any time; there is one warning for each kind of call."""
     with journalling(tmp_path) as logger:
         for _ in range(3):
             logger.log_camera_frame(JPEG, 0)
@@ -75,7 +75,7 @@ def fail(mission: Mission) -> None:
 
 
 def test_an_exception_ends_the_mission_and_propagates(tmp_path: Path) -> None:
-    """What is raised inside ``with`` is recorded, ends the mission as FAILED, and reaches the agent unchanged."""
+    """An exception inside ``with`` is recorded, ends the mission as FAILED, and reaches the agent unchanged."""
     with journalling(tmp_path) as logger:
         with pytest.raises(ZeroDivisionError, match='oh'), logger.mission('explore', 'up') as mission:
             fail(mission)
@@ -99,7 +99,7 @@ def test_a_with_block_that_ends_normally_is_a_success(tmp_path: Path) -> None:
 
 
 def test_a_second_start_ends_the_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """It ends as KILLED with a warning, and what follows belongs to the second."""
+    """It ends as KILLED with a warning, and later calls belong to the second."""
     with journalling(tmp_path) as logger:
         first = logger.start_mission('patrol', '1')
         second = logger.start_mission('patrol', '2')
@@ -114,7 +114,7 @@ def test_a_second_start_ends_the_first(tmp_path: Path, caplog: pytest.LogCapture
 
 
 class Mute(Exception):
-    """What has no text."""
+    """An object without text."""
 
     def __str__(self) -> str:
         raise ZeroDivisionError
@@ -177,7 +177,7 @@ def test_a_hostile_type_is_made_safe(tmp_path: Path, given: Any, named: str) -> 
 
 
 def test_events_hold_anything_but_files(tmp_path: Path) -> None:
-    """What JSON cannot hold becomes text, whatever it is called; what is as large as a file is refused."""
+    """Values that JSON cannot hold become text, whatever their name; those as large as a file are refused."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_event('seen', name='a cat', self=1, where=Path('/x'), how=math.nan, what={1: {2, 3}}, deep=[[[[[[1]]]]]])
@@ -315,7 +315,7 @@ def _frame_in_a_fork(mission: Mission, path: Path) -> None:
 
 @pytest.mark.filterwarnings('ignore:This process .* is multi-threaded')
 def test_a_fork_touches_no_file_of_the_mission(tmp_path: Path) -> None:
-    """A child that has the mission itself in hand writes none."""
+    """A child that uses the mission object writes none."""
     with journalling(tmp_path) as logger, logger.mission('patrol', '') as mission:
         files = mission.folder.files
         child = multiprocessing.get_context('fork').Process(target=_frame_in_a_fork, args=(mission, Path(__file__)))
@@ -339,7 +339,7 @@ def test_calls_after_the_end_write_no_file(tmp_path: Path) -> None:
 
 
 def test_closing_ends_the_mission_as_killed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A logger that is closed in a mission says so; closing twice is the same as once."""
+    """A logger that is closed during a mission records that; closing twice is the same as once."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.close()
@@ -355,7 +355,7 @@ def test_a_robot_name_is_checked_immediately(tmp_path: Path) -> None:
 
 
 def test_an_invalid_home_is_rejected_immediately(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the node refuses it: a user without a home, in a container say, has to name the folder."""
+    """As in the node: a user without a home, for example in a container, must name the folder."""
     monkeypatch.setenv('SHADOWHOUND_HOME', '~no-such-user/x')
     with pytest.raises(SettingError, match='SHADOWHOUND_HOME'):
         MissionDataLogger(replay=False)
@@ -374,7 +374,7 @@ def test_logged_records_are_synced_within_a_quarter_of_a_second(tmp_path: Path, 
             file = Path(f'/proc/self/fd/{descriptor}').readlink()
             synced.append('the frame' if file.is_file() and file.read_bytes() == JPEG + b'1' else file.name)
             fsync(descriptor)
-            if synced[-1] == 'journal' and 'the frame' in synced:  # the one before may be on its way as well
+            if synced[-1] == 'journal' and 'the frame' in synced:  # the one before may be in progress as well
                 done.set()
 
         monkeypatch.setattr(os, 'fsync', note)

@@ -35,7 +35,7 @@ def ended(logger: MissionDataLogger) -> None:
 
 @pytest.mark.seaweedfs
 def test_a_mission_has_its_run_before_mlflow_is_loaded(server: Server, home: Path) -> None:
-    """Right after the constructor; the sender, which starts at the same time, makes no second one, and sends everything."""
+    """Right after the constructor; the sender, which starts at the same time, creates no second one, and sends everything."""
     logger = MissionDataLogger(home=home, start_timeout_s=PATIENCE_S)
     given = logger.start_mission('patrol', 'before MLflow')
     assert not (home / MISSIONS / 'replay.json').exists(), 'the sender is there already'
@@ -56,7 +56,7 @@ def test_a_mission_has_its_run_before_mlflow_is_loaded(server: Server, home: Pat
 
 @pytest.mark.seaweedfs
 def test_starting_a_mission_costs_one_request(server: Server, warm_home: Path) -> None:
-    """The experiment is looked for by the constructor, and both take little CPU; bench/mission_calls.py measures the time."""
+    """The experiment is looked up by the constructor, and both take little CPU; bench/mission_calls.py measures the time."""
     heard = bytearray()
     with Wire(server.tower.tracking_uri, heard.extend) as wire:
         logger = MissionDataLogger(home=warm_home, start_timeout_s=PATIENCE_S, tracking_uri=wire.url)
@@ -94,7 +94,7 @@ def test_the_sender_is_woken_after_the_request(home: Path, monkeypatch: pytest.M
 
 @pytest.mark.seaweedfs
 def test_many_missions_in_a_row_have_a_run_each(server: Server, warm_home: Path) -> None:
-    """The agent and the sender look after the same missions at the same time."""
+    """The agent and the sender process the same missions at the same time."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=PATIENCE_S)
     given = []
     for number in range(10):
@@ -108,7 +108,7 @@ def test_many_missions_in_a_row_have_a_run_each(server: Server, warm_home: Path)
 @pytest.mark.seaweedfs
 @pytest.mark.long('four senders')
 def test_an_experiment_is_created_once(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By whichever of several loggers is first; the others use it. Who logs in by the URL is known by it."""
+    """By the first of several loggers; the others use it. A user in the URL is recorded."""
     login, experiment = server.tower.tracking('tower'), f'once {tmp_path.name}'
     address = f'//{login["MLFLOW_TRACKING_USERNAME"]}:{login["MLFLOW_TRACKING_PASSWORD"]}@'
     options = {'home': home, 'tracking_uri': server.wire.url.replace('//', address) + '/', 'experiment': experiment}
@@ -143,7 +143,7 @@ def test_without_a_server_the_mission_starts_immediately(server: Server, home: P
 @pytest.mark.seaweedfs
 @pytest.mark.long('a request that is given up')
 def test_a_server_that_hangs_blocks_no_mission(server: Server, home: Path) -> None:
-    """The call takes as long as it says; the run is made once, when the server is back."""
+    """The call takes no longer than its timeout; the run is created once, when the server responds again."""
     server.wire.set(HANG)
     logger = MissionDataLogger(home=home, start_timeout_s=0.3)
     began = time.monotonic()
@@ -169,7 +169,7 @@ def test_a_run_that_was_not_saved_is_found(server: Server, warm_home: Path, monk
 @pytest.mark.seaweedfs
 @pytest.mark.long('a sender of its own')
 def test_a_run_is_created_behind_tls(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With an authority whose file is named relative to the agent's folder: for the run, and for all that the sender sends."""
+    """With a CA file relative to the agent's folder: for the run, and for everything that the sender sends."""
     authority = Authority(tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('MLFLOW_TRACKING_SERVER_CERT_PATH', authority.path.name)
@@ -197,7 +197,7 @@ def folder(tmp_path: Path) -> MissionFolder:
 
 
 class Clock:
-    """A monotonic one that a test sets."""
+    """A monotonic clock set by the test."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -221,7 +221,7 @@ def test_the_sender_waits_for_the_agents_request(folder: MissionFolder) -> None:
 
 @pytest.mark.parametrize('how', ['failed', 'killed', 'hung'])
 def test_the_sender_creates_the_run_when_the_agent_could_not(folder: MissionFolder, how: str) -> None:
-    """After a failure, the agent's death, or half a minute."""
+    """After a failure, the agent's exit, or 30 seconds."""
     new, tracking, clock = NewRun(folder), FakeTracking(), Clock()
     delivery = Delivery(folder, tracking, FakeSpooler(), monotonic=clock)  # type: ignore[arg-type]
     assert not delivery.track()
@@ -274,7 +274,7 @@ def test_a_file_system_without_folder_locks_is_supported(tmp_path: Path, monkeyp
 def test_a_fork_does_not_keep_the_mission_open(folder: MissionFolder) -> None:
     """A process that was forked during the request has a copy of the lock, which ends with the request."""
     new = NewRun(folder)
-    copy = os.dup(new._descriptor)  # as a forked process has it
+    copy = os.dup(new._descriptor)  # as in a forked process
     try:
         new.settle()
         assert not journal.is_locked(folder.path)
@@ -283,7 +283,7 @@ def test_a_fork_does_not_keep_the_mission_open(folder: MissionFolder) -> None:
 
 
 def test_a_mission_without_a_date_has_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run's start cannot be changed later: it is made when the clock was set."""
+    """A run's start cannot be changed later: it is created once the clock is set."""
     asked: list[object] = []
     monkeypatch.setattr(RunRequests, 'prepare', lambda _: None)
     monkeypatch.setattr(RunRequests, 'create', lambda *arguments: asked.append(arguments))
@@ -303,5 +303,5 @@ def test_a_mission_without_a_date_has_no_run(tmp_path: Path, monkeypatch: pytest
     ({'MLFLOW_TRACKING_URI': 'https://tower', 'MLFLOW_TRACKING_AUTH': 'kubernetes'}, False),
 ])  # fmt: skip
 def test_only_servers_that_take_plain_requests_are_asked(environ: dict[str, str], can: bool) -> None:
-    """The rest is left to MLflow's own client."""
+    """Others are left to MLflow's client."""
     assert RunRequests.is_supported(environ) is can

@@ -22,7 +22,7 @@ JPEG = b'\xff\xd8 picture \xff\xd9'
 
 @pytest.fixture
 def mission(tmp_path: Path) -> Iterator[ActiveMission]:
-    """An active one."""
+    """An active mission."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         found = MissionFinder(tmp_path, 'thor').active()
@@ -50,7 +50,7 @@ def distances(mission: ActiveMission) -> list[float]:
 
 
 def test_poses_of_several_threads_are_sorted(mission: ActiveMission) -> None:
-    """Whichever encoder is faster: no way is counted twice and none is lost."""
+    """Whichever encoder is faster: no distance is counted twice and none is lost."""
     node_log, poses = opened(mission), walk(mission, range(60))
     rng = random.Random(1)
     for start in range(0, 60, 2):
@@ -73,7 +73,7 @@ def test_readings_outside_the_mission_are_skipped(mission: ActiveMission) -> Non
 
 
 def test_a_second_node_continues_where_the_first_was_killed(mission: ActiveMission) -> None:
-    """Distance and frames are counted on, and a torn record costs itself alone."""
+    """Distance and frames continue, and a torn record is the only loss."""
     first = opened(mission)
     for fact in (*walk(mission, range(5)), Frame(mission.start_ns, JPEG)):
         first.add(fact)
@@ -92,7 +92,7 @@ def test_a_second_node_continues_where_the_first_was_killed(mission: ActiveMissi
 
 
 def test_two_nodes_do_not_write_one_journal(mission: ActiveMission) -> None:
-    """The second is refused for as long as the first has it."""
+    """The second is refused while the first has it."""
     first = opened(mission)
     with pytest.raises(BlockingIOError):
         NodeLog(mission, SECOND, 5.0).open()
@@ -101,7 +101,7 @@ def test_two_nodes_do_not_write_one_journal(mission: ActiveMission) -> None:
 
 
 def test_the_floor_plan_is_what_the_lidar_saw(mission: ActiveMission) -> None:
-    """Neither ground nor ceiling nor another frame's points, and a node that comes later adds to it."""
+    """Neither ground nor ceiling nor points of another frame, and a node that starts later adds to it."""
     cloud = np.array([[1, 2, 0.5], [3, 4, 0.0], [5, 6, 2.0], [np.nan, 1, 1]], np.float32)
     for second in range(2):
         node_log, at_ns = opened(mission), mission.start_ns + second * SECOND
@@ -114,7 +114,7 @@ def test_the_floor_plan_is_what_the_lidar_saw(mission: ActiveMission) -> None:
 
 @pytest.mark.long('a second of CPU or more')
 def test_the_floor_plan_stays_small() -> None:
-    """However long the mission is; what remains is of all of it."""
+    """However long the mission is; the remaining points are from all of it."""
     floor, rng = FloorPlan(), np.random.default_rng(1)
     for second in range(500):
         floor.add(np.column_stack([np.full(20_000, second), rng.random(20_000), np.ones(20_000)]).astype(np.float32))

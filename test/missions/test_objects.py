@@ -43,7 +43,7 @@ def spooler(tmp_path: Path) -> Iterator[Spooler]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> MissionFolder:
-    """A mission with two frames of the same id and other content, and a trajectory."""
+    """A mission with two frames with the same id but different content, and a trajectory."""
     csv = tmp_path / 't.csv'
     csv.write_text('timestamp,x,y,yaw\n')
     with journalling(tmp_path) as logger:
@@ -64,7 +64,7 @@ def spooled(home: Path) -> dict[str, str]:
 
 
 def test_objects_added_twice_are_spooled_once(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
-    """A replayer that was killed before it noted its progress adds nothing again, frames of one id included."""
+    """A replayer that was killed before it recorded its progress adds nothing again, including frames with the same id."""
     prefix = 'thor/missions/abc'
     for _ in range(3):
         spooler.add(objects(folder, RUN))
@@ -76,14 +76,14 @@ def test_objects_added_twice_are_spooled_once(tmp_path: Path, spooler: Spooler, 
 
 
 def test_a_frame_with_a_longer_number_is_a_different_frame(tmp_path: Path, spooler: Spooler) -> None:
-    """Though its picture is the same, and its name begins as the other's."""
+    """Though its image is the same, and its name has the same start."""
     for number in (100_000, 1_000_000):
         spooler.add([make(f'thor/missions/abc/camera/frame_{number:06d}.jpg', topic=None)])
     assert len(spooled(tmp_path)) == 2
 
 
 def test_held_objects_get_the_name_of_the_run(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
-    """Under the run's id, with it in the metadata; handed over again afterwards it is still there once."""
+    """Under the run's id, which is also in the metadata; added again afterwards it is still there once."""
     spooler.add(objects(folder, None))
     assert set(spooled(tmp_path).values()) == {'held'}
     assert spooler.bind(folder.mission_id, 'abc')
@@ -99,7 +99,7 @@ def test_held_objects_get_the_name_of_the_run(tmp_path: Path, spooler: Spooler, 
 
 
 def test_without_a_node_the_agent_delivers(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
-    """The folder store has all of it, and the drain is free again afterwards."""
+    """The directory store has all of it, and the drain lock is free again afterwards."""
     spooler.add(objects(folder, RUN))
     assert spooler.has_unsent
     spooler.drain()
@@ -135,7 +135,7 @@ def test_objects_of_an_earlier_process_are_delivered(tmp_path: Path, spooler: Sp
 
 
 def test_a_larger_spool_is_left_to_the_node(tmp_path: Path, folder: MissionFolder) -> None:
-    """The parameters of a node are not the agent's: by those that it has itself it would evict what the node keeps."""
+    """An agent has no node parameters: with its defaults it would evict what the node keeps."""
     root = tmp_path / 'spool'
     node = new_spool(root, max_bytes=64 << 20)
     node.open()
@@ -152,7 +152,7 @@ def test_a_larger_spool_is_left_to_the_node(tmp_path: Path, folder: MissionFolde
 
 
 def test_delivery_survives_the_loss_of_the_index(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
-    """The objects that come then are refused once, and taken when they are handed over again."""
+    """Objects added after the loss are refused once, and accepted when they are added again."""
     first, *others = objects(folder, RUN)
     spooler.add([first])
     index = tmp_path / 'spool' / 'index.db'
@@ -169,7 +169,7 @@ def test_delivery_survives_the_loss_of_the_index(tmp_path: Path, spooler: Spoole
 
 
 def test_an_agent_without_a_node_writes_the_catalog(tmp_path: Path) -> None:
-    """Its sender delivers, writes a part of what it delivered, and delivers that; rows have mission, run, time and pose."""
+    """Its sender delivers, writes a part for the delivered objects, and delivers that; rows have mission, run, time and pose."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_camera_frame(b'\xff\xd8one', 7)
@@ -235,7 +235,7 @@ FRAME = b'\xff\xd8' + bytes(50_000) + b'\xff\xd9'
 
 @contextmanager
 def held(home: Path) -> Iterator[None]:
-    """A transaction of another process that does not end."""
+    """A transaction of another process that stays open."""
     with closing(sqlite3.connect(home / 'spool/index.db', isolation_level=None)) as other:
         other.execute('BEGIN IMMEDIATE')
         yield
@@ -243,7 +243,7 @@ def held(home: Path) -> Iterator[None]:
 
 
 def log(logger: MissionDataLogger, first: int) -> list[float]:
-    """Seconds that each call took."""
+    """The duration of each call in seconds."""
     took: list[float] = []
     for number in range(first, first + CALLS):
         calls: tuple[Callable[[], object], ...] = (
@@ -290,5 +290,5 @@ def test_a_busy_index_delays_the_delivery_and_no_call(tmp_path: Path, monkeypatc
 
 
 def count_frames(home: Path) -> int:
-    """How many frames."""
+    """The number of frames."""
     return sum(row['key'].endswith('.jpg') for row in rows(home / 'spool'))

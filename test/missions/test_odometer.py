@@ -13,7 +13,7 @@ SECOND = 10**9
 
 
 def walked(*steps: tuple[float, float, float], frame_id: str = 'odom', max_speed_mps: float = 5.0) -> Odometer:
-    """What an odometer says of (seconds, x, y)."""
+    """The distance for odometry of (seconds, x, y)."""
     odometer = Odometer(max_speed_mps)
     for seconds, x, y in steps:
         odometer.add(Pose(round(seconds * SECOND), x, y, 0.0, frame_id=frame_id))
@@ -21,12 +21,12 @@ def walked(*steps: tuple[float, float, float], frame_id: str = 'odom', max_speed
 
 
 def test_a_distance_is_the_sum_of_its_steps() -> None:
-    """There and back again counts twice."""
+    """The way there and back counts twice."""
     assert walked((0, 0, 0), (1, 3, 0), (2, 3, 4), (3, 3, 0)).distance_m == pytest.approx(3 + 4 + 4)
 
 
 def test_a_fast_drone_is_counted() -> None:
-    """At 15 m/s its way counts, but for the first step; a jump on the way does not, nor an estimate that jumps back and forth."""
+    """At 15 m/s its path counts, except for the first step; jumps do not, nor an estimate that jumps back and forth."""
     odometer = Odometer()
     for number in range(101):
         odometer.add(Pose(number * SECOND // 10, 1.5 * number + (200 if number >= 50 else 0), 0.0, 0.0))
@@ -44,13 +44,13 @@ def test_a_jump_is_not_counted() -> None:
 
 
 def test_a_jump_after_a_rest_is_not_counted() -> None:
-    """However long the robot stood: the jump itself took one period."""
+    """However long the robot was at rest: the jump itself took one period."""
     rest = [(number / 10, 0.001 * (number % 2), 0.0) for number in range(600)]
     assert walked(*rest, (60.0, 8, 0), (60.1, 8.2, 0)).distance_m == pytest.approx(0.2)
 
 
 def test_another_frame_has_another_origin() -> None:
-    """Between poses of two frames lies no way."""
+    """There is no distance between poses of two frames."""
     odometer = walked((0, 0, 0), (1, 1, 0))
     odometer.add(Pose(2 * SECOND, 2.0, 0.0, 0.0, frame_id='map'))
     odometer.add(Pose(3 * SECOND, 3.0, 0.0, 0.0, frame_id='map'))
@@ -58,7 +58,7 @@ def test_another_frame_has_another_origin() -> None:
 
 
 def test_noise_at_rest_is_not_counted() -> None:
-    """A minute of millimetres at 50 Hz is nothing."""
+    """A minute of millimeter noise at 50 Hz is zero."""
     rng = random.Random(1)
     assert walked(*((number / 50, rng.gauss(0, 0.002), rng.gauss(0, 0.002)) for number in range(3000))).distance_m < 0.1
 

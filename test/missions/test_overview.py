@@ -46,7 +46,7 @@ def said(folder: MissionFolder) -> Report:
 
 
 def test_a_mission_that_no_process_sends_is_named(folder: MissionFolder) -> None:
-    """The command that does is named."""
+    """The command that sends it is named."""
     found = said(folder)
     assert found.waiting_for == 'a sender'
     assert 'missions resume' in found.remedy
@@ -88,7 +88,7 @@ def test_a_mission_waits_for_its_node(folder: MissionFolder) -> None:
 
 @pytest.mark.usefixtures('sender')
 def test_the_error_that_delays_a_mission_is_shown(folder: MissionFolder) -> None:
-    """What the sender says of the server stands before what was refused earlier."""
+    """The error of the server that the sender reports precedes earlier refusals."""
     folder.set_sent(folder.sent().__class__(error='an artifact was refused', unattached=1))
     write_json(
         folder.path.parent / STATE, {'pid': 1, 'errors': {'tracking': {'error': 'Tower is away', 'remedy': 'switch it on'}}}
@@ -99,7 +99,7 @@ def test_the_error_that_delays_a_mission_is_shown(folder: MissionFolder) -> None
 
 
 def test_an_active_mission_waits_for_its_end(tmp_path: Path) -> None:
-    """For ``flush`` in the middle of one."""
+    """For a ``flush`` during the mission."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         found = logger.flush(0.0)
@@ -108,7 +108,7 @@ def test_an_active_mission_waits_for_its_end(tmp_path: Path) -> None:
 
 
 def test_a_complete_mission_waits_for_nothing(folder: MissionFolder) -> None:
-    """Though something was refused, which is counted with its reason."""
+    """Even with a refused record, which is counted by reason."""
     tracking = FakeTracking(refuses=lambda point: point.key == 'a')
     delivery = Delivery(folder, tracking, FakeSpooler())  # type: ignore[arg-type]
     while not delivery.complete():
@@ -119,6 +119,6 @@ def test_a_complete_mission_waits_for_nothing(folder: MissionFolder) -> None:
 
 
 def test_a_missing_journal_is_reported(folder: MissionFolder) -> None:
-    """The report says so, and does not raise."""
+    """The report names it, and nothing is raised."""
     folder.journal.unlink()
     assert 'missing' in said(folder).waiting_for

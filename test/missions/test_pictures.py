@@ -1,4 +1,4 @@
-"""The pictures of a mission: created independently from the journals, in a process that does not block the sender."""
+"""The images of a mission: created independently from the journals, in a process that does not block the sender."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def path(count: int = 50) -> str:
 
 
 def test_a_mission_has_three_images(tmp_path: Path) -> None:
-    """All of a width, with the floor plan where there is one, and nothing to say about them."""
+    """All with the same width, with a floor plan if available, and without notes."""
     folder = fly(tmp_path, frames=7, rows=path())
     np.save(folder.floor, np.random.default_rng(1).uniform(-3, 3, (500, 2)).astype(np.float32))
     assert make(folder, 'patrol_1') == dict.fromkeys(NAMES, '')
@@ -61,7 +61,7 @@ def test_a_mission_has_three_images(tmp_path: Path) -> None:
 
 
 def test_an_image_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None:
-    """The note contains the reason, and the other pictures exist."""
+    """The note contains the reason, and the other images exist."""
     folder = fly(tmp_path, frames=2, broken=1, rows='timestamp,x,y\n1,nan,2\nx,1,2\n')
     folder.floor.write_bytes(b'no array')
     notes = make(folder, 'patrol_1')
@@ -82,7 +82,7 @@ def test_an_empty_mission_has_no_images(tmp_path: Path) -> None:
 
 
 def test_the_nodes_data_replace_missing_data(tmp_path: Path) -> None:
-    """What the agent did not log is taken from the node, and only that."""
+    """Values that the agent did not log are taken from the node, and only those."""
     folder = fly(tmp_path, frames=0, states=3)
     folder.node.files.mkdir(parents=True)
     (folder.node.files / 'a.jpg').write_bytes(jpeg(1))
@@ -115,8 +115,8 @@ def test_a_trajectory_is_read(tmp_path: Path, text: str, expected: list[tuple[fl
 
 
 def test_a_speed_plot_has_no_noise() -> None:
-    """Centimetres of noise at 20 Hz do not make a robot that walks at 0.5 m/s a runner; time that stands gives no speed."""
-    from shadowhound_data_logger.missions.plots import _speed  # loads matplotlib, for which only the worker that runs it waits
+    """Centimeters of noise at 20 Hz do not make a robot that walks at 0.5 m/s a runner; constant times give no speed."""
+    from shadowhound_data_logger.missions.plots import _speed  # loads matplotlib, which only delays the worker that runs it
 
     time = np.arange(0, 20, 0.05)
     xy = np.stack([0.5 * time, np.zeros_like(time)], axis=1) + np.random.default_rng(1).normal(0, 0.01, (len(time), 2))
@@ -139,7 +139,7 @@ def test_a_separate_process_draws(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('program', ['no_such_module', 'hang'])
 def test_a_process_that_fails_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str) -> None:
-    """If it exits or hangs, the mission continues without pictures, and the next mission is drawn."""
+    """If it exits or hangs, the mission continues without images, and the next mission is drawn."""
     hanging = tmp_path / 'hang.py'
     hanging.write_text('import time\ntime.sleep(600)\n')
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
@@ -156,7 +156,7 @@ def test_a_process_that_fails_is_reported(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_mission_waits_for_its_images(tmp_path: Path) -> None:
-    """They are artifacts of its run, and the summary says what became of them, as artifact and as object."""
+    """They are artifacts of its run, and the summary has their outcome, as artifact and as object."""
     folder = fly(tmp_path)
     answers = iter([None, None])
 

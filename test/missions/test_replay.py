@@ -1,4 +1,4 @@
-"""The sender's rounds: outages, many missions, who comes first, and when it ends."""
+"""The sender's rounds: outages, many missions, their order, and when it exits."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def fly(home: Path, mission_type: str = 'patrol') -> str:
 
 
 def test_all_missions_are_sent(tmp_path: Path) -> None:
-    """Of every agent that ever logged here, and then there is nothing to do."""
+    """Those of every agent that ever logged here; then there is nothing to do."""
     for _ in range(3):
         fly(tmp_path)
     tracking = FakeTracking()
@@ -72,7 +72,7 @@ def test_all_missions_are_sent(tmp_path: Path) -> None:
 
 @pytest.mark.long('an hour of a simulated outage')
 def test_an_outage_is_probed_less_and_less_often(tmp_path: Path) -> None:
-    """At most one request a round, pauses up to a minute; the state says what is wrong and what to do, until it is over."""
+    """At most one request per round, pauses up to a minute; the state has the error and the remedy, until it ends."""
     for _ in range(5):
         fly(tmp_path)
     asked: list[float] = []
@@ -97,7 +97,7 @@ def test_an_outage_is_probed_less_and_less_often(tmp_path: Path) -> None:
 
 
 def test_a_mission_that_begins_ends_a_pause(tmp_path: Path) -> None:
-    """Its agent waits for the run's id for two seconds, and an outage's pause may be a minute."""
+    """Its agent waits two seconds for the run's id, and an outage's pause may take a minute."""
     fly(tmp_path)
     now, away = Now(), True
     tracking = FakeTracking(fail=lambda _: away)
@@ -114,7 +114,7 @@ def test_a_mission_that_begins_ends_a_pause(tmp_path: Path) -> None:
 
 
 def test_the_newest_mission_comes_first(tmp_path: Path) -> None:
-    """An agent that begins does not wait for the backlog of others, whatever its mission is called."""
+    """An agent that starts does not wait for the backlog of others, whatever its mission is called."""
     old = tmp_path / MISSIONS / fly(tmp_path, 'zzz')
     old.rename(old.with_name('zzz_20200101_000000_00000000'))
     newest = fly(tmp_path, 'aaa')
@@ -138,7 +138,7 @@ def test_a_corrupt_mission_does_not_stop_the_others(tmp_path: Path, caplog: pyte
 
 
 def test_a_mission_that_arrived_long_ago_is_deleted(tmp_path: Path) -> None:
-    """After a month, at the next start; one that is younger or has not arrived stays."""
+    """After a month, at the next start; a newer one, or one that has not arrived, stays."""
     old, young = fly(tmp_path), fly(tmp_path)
     replay = new_replay(tmp_path, FakeTracking())
     while replay.step():
@@ -165,7 +165,7 @@ def test_the_default_store_is_private(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_deleted_run_is_reported(tmp_path: Path) -> None:
-    """Its mission is left alone, with the reason in its report."""
+    """Its mission is not changed, and the report has the reason."""
     mission_id = fly(tmp_path)
     replay = new_replay(tmp_path, FakeTracking(gone=True))
     while replay.step():
@@ -176,7 +176,7 @@ def test_a_deleted_run_is_reported(tmp_path: Path) -> None:
 
 
 def test_pauses_grow_to_a_minute_and_end_with_a_success() -> None:
-    """Full jitter: between nothing and the cap, which doubles."""
+    """Full jitter: between zero and the cap, which doubles."""
     now = Now()
     gate = RetryGate(now, random.Random(2))
     longest = 0.0
@@ -193,7 +193,7 @@ def test_pauses_grow_to_a_minute_and_end_with_a_success() -> None:
 
 
 def test_the_sender_exits_after_its_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At once when all is sent; after ten minutes when nothing gets through."""
+    """Immediately when everything is sent; after ten minutes when nothing can be sent."""
     fly(tmp_path)
     now = Now()
     monkeypatch.setattr('shadowhound_data_logger.missions.replay.time.monotonic', now)
@@ -214,7 +214,7 @@ def test_the_sender_exits_after_its_agent(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_byte_wakes_the_sender() -> None:
-    """And the end of its input is that of the agent."""
+    """And the end of its input means that the agent has exited."""
     reader, writer = os.pipe()
     parent = AgentProcess(reader)
     os.write(writer, b'\n')
@@ -227,7 +227,7 @@ def test_a_byte_wakes_the_sender() -> None:
 
 
 def test_a_second_sender_waits_and_exits_with_its_agent(tmp_path: Path) -> None:
-    """One a home sends."""
+    """One per home sends."""
     (tmp_path / MISSIONS).mkdir()
     with flock(tmp_path / MISSIONS / 'replay.lock', wait=False) as mine:
         assert mine
@@ -263,7 +263,7 @@ def test_a_sender_whose_agent_has_exited_yields_to_another(tmp_path: Path) -> No
 
 @pytest.mark.long('two processes that load MLflow')
 def test_a_corrected_address_is_used_although_an_earlier_sender_is_stuck(tmp_path: Path) -> None:
-    """The address of an agent that was killed answers nothing; the sender of the next agent takes over and sends the mission."""
+    """The address of an agent that was killed does not respond; the sender of the next agent takes over and sends the mission."""
     mission_id = fly(tmp_path)
     command = [sys.executable, '-m', 'shadowhound_data_logger.missions.replay', '--home', str(tmp_path), '--experiment', 'x']
     with socket.create_server(('127.0.0.1', 0)) as silent, ExitStack() as running:
@@ -283,7 +283,7 @@ def test_a_corrected_address_is_used_although_an_earlier_sender_is_stuck(tmp_pat
 
 
 def test_the_logger_restarts_the_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sender that dies is restarted after a pause, is never a zombie, and does not remain after its logger."""
+    """A sender that crashes is restarted after a pause, is never a zombie, and exits with its logger."""
     monkeypatch.setattr('shadowhound_data_logger.missions.child.RESTART_PAUSE_S', 0.1)
     monkeypatch.setattr('shadowhound_data_logger.missions.child.interpreter', lambda: '/bin/false')
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0)
@@ -298,7 +298,7 @@ def test_the_logger_restarts_the_sender(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize('what', ['journal', 'artifact'])
 def test_a_mission_that_always_fails_blocks_no_other(tmp_path: Path, what: str) -> None:
-    """A journal that the disk does not give back, an artifact that the server never gets: the older missions arrive."""
+    """A journal that the disk cannot read, an artifact that the server never accepts: the older missions arrive."""
     for number in range(3):
         older = tmp_path / MISSIONS / fly(tmp_path)
         older.rename(older.with_name(f'patrol_20200101_00000{number}_00000000'))

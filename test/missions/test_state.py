@@ -1,6 +1,6 @@
-"""What ``end_mission`` states is what MLflow shows of the run, whatever was logged under the same names before.
+"""The values in ``end_mission`` are those that MLflow shows for the run, whatever was logged under the same names before.
 
-Who ran what: a mission says which policies were active, in their order.
+Missions also record the policies that were active, in order.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ EXPECTED = {'success': 1.0, 'duration_s': 600.0, 'distance_m': 42.0, 'distance_t
 
 
 def log(logger: MissionDataLogger, step: int) -> None:
-    """Values of the agent's own, larger than those that it states, at one step and once more at the same."""
+    """Values logged by the agent, larger than those in its statement, at one step and once more at the same."""
     for value in (1e6, 1e9):
         for key in KEYS:
             logger.log_metric(key, value, step)
@@ -57,7 +57,7 @@ def deliver(folder: MissionFolder, tracking: MlflowTracking | FakeTracking) -> s
 @pytest.mark.filterwarnings('ignore')
 @pytest.mark.parametrize('store', ['sqlite', 'file'])
 def test_a_local_store_shows_the_stated_values(tmp_path: Path, store: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At every step that MLflow takes."""
+    """At every step that MLflow accepts."""
     monkeypatch.setenv('MLFLOW_ALLOW_FILE_STORE', 'true')
     uri = f'sqlite:///{tmp_path}/mlflow.db' if store == 'sqlite' else f'file://{tmp_path}/mlruns'
     tracking = MlflowTracking(uri, 'final', tmp_path / 'artifacts')
@@ -73,7 +73,7 @@ def test_a_local_store_shows_the_stated_values(tmp_path: Path, store: str, monke
 
 @pytest.mark.seaweedfs
 def test_a_server_shows_the_stated_values(server: Server, warm_home: Path) -> None:
-    """Also in its list of runs, which can be sorted by it."""
+    """Also in its list of runs, which can be sorted by them."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     logger.start_mission('patrol', 'stated')
     log(logger, 7)
@@ -107,7 +107,7 @@ def test_stated_values_are_the_newest_after_the_clock_was_set_back(tmp_path: Pat
 def test_logged_values_are_used_if_none_are_stated(
     tmp_path: Path, stated: float | None, logged: float | None, expected: float
 ) -> None:
-    """In MLflow and in ``summary.json`` alike."""
+    """In MLflow and in ``summary.json``."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         if logged is not None:
@@ -134,12 +134,12 @@ def logger(tmp_path: Path) -> Iterator[MissionDataLogger]:
 
 
 def activate(home: Path, name: str | None) -> None:
-    """As a rollback does, of a version that need not be there."""
+    """As a rollback does; the version need not exist."""
     PolicyFolder(home)._link(name)
 
 
 def told_of(home: Path) -> list[tuple[MissionState, dict[str, Any]]]:
-    """The story and the summary of each mission, the first one first."""
+    """The policy history and the summary of each mission, the first one first."""
     stories = []
     for records in journals(home):
         story = MissionState()
@@ -150,7 +150,7 @@ def told_of(home: Path) -> list[tuple[MissionState, dict[str, Any]]]:
 
 
 def test_a_mission_records_the_active_policy(tmp_path: Path, logger: MissionDataLogger) -> None:
-    """In the params of its run and in its summary; one that had none says none."""
+    """In the params of its run and in its summary; without a policy there is no entry."""
     for name in (None, NEW):
         activate(tmp_path, name)
         logger.start_mission(f'patrol_{name is not None}', 'go round')
@@ -161,7 +161,7 @@ def test_a_mission_records_the_active_policy(tmp_path: Path, logger: MissionData
 
 
 def test_a_rollback_during_a_mission_is_recorded(tmp_path: Path, logger: MissionDataLogger) -> None:
-    """Both policies in their order and when it was; also where the agent logs nothing after it, and where none is left."""
+    """Both policies in order with the time; also if the agent logs nothing after it, and if none is active afterwards."""
     activate(tmp_path, NEW)
     logger.start_mission('patrol', 'go round')
     picture = io.BytesIO()
@@ -171,7 +171,7 @@ def test_a_rollback_during_a_mission_is_recorded(tmp_path: Path, logger: Mission
     assert mission is not None
     for name in (OLD, None):
         activate(tmp_path, name)
-        mission.sync()  # as the thread of the logger does ten times a second
+        mission.sync()  # as the logger's thread does ten times per second
         mission.sync()
     activate(tmp_path, OLD)
     logger.end_mission(False, 1.0, 2.0)

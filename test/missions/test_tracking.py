@@ -1,4 +1,4 @@
-"""Missions against every kind of MLflow server that is promised, each the real one."""
+"""Missions against every supported kind of MLflow server, each a real one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ POINTS = [Point('battery_pct', 90.0 - number, 1_760_788_800_000 + number, number
 
 @pytest.fixture(scope='module')
 def database(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A SQLite file, whose tables take a second to make; each test has a separate experiment in it."""
+    """A SQLite file, with tables that take a second to create; each test has a separate experiment in it."""
     return f'sqlite:///{tmp_path_factory.mktemp("local")}/mlflow.db'
 
 
@@ -55,7 +55,7 @@ def tracking(request: pytest.FixtureRequest, database: str, tmp_path: Path, monk
 
 @pytest.mark.filterwarnings('ignore')
 def test_a_mission_sent_twice_is_there_once(tracking: MlflowTracking, tmp_path: Path) -> None:
-    """A second replayer finds the run; points, params and artifacts stay what they are. A folder alone keeps a point twice."""
+    """A second replayer finds the run; points, params and artifacts are unchanged. A plain folder stores a point twice."""
     artifact = tmp_path / 'summary.json'
     artifact.write_text('{}')
     again = MlflowTracking(tracking._uri, 'thor_missions', tmp_path / 'artifacts')
@@ -77,7 +77,7 @@ def test_a_mission_sent_twice_is_there_once(tracking: MlflowTracking, tmp_path: 
 
 @pytest.mark.parametrize('uri', ['nosuch://tower', 'tower:5001'])
 def test_an_address_that_this_mlflow_does_not_support_is_waited_for(uri: str) -> None:
-    """As sqlite: is for mlflow-skinny. It is not a refusal of a mission: the sender keeps running, and reports the setting."""
+    """For example sqlite: with mlflow-skinny. The mission is not refused: the sender keeps running, and reports the setting."""
     with pytest.raises(TrackingUnavailable, match='set MLFLOW_TRACKING_URI to a server'):
         MlflowTracking(uri, 'thor_missions').open()
 
@@ -85,7 +85,7 @@ def test_an_address_that_this_mlflow_does_not_support_is_waited_for(uri: str) ->
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.filterwarnings('ignore')
 def test_a_duplicate_is_closed(database: str, tmp_path: Path) -> None:
-    """A run that a lost request made after all goes when the mission ends, and says whose duplicate it was."""
+    """A run that a lost request created after all is deleted when the mission ends, and names the original."""
     tracking = MlflowTracking(database, 'duplicates', tmp_path / 'artifacts')
     run = run_of(tracking)
     twin = tracking._client.create_run(run.experiment_id, start_time=1_760_788_800_001, tags={MISSION_TAG: 'patrol_1'})
@@ -96,7 +96,7 @@ def test_a_duplicate_is_closed(database: str, tmp_path: Path) -> None:
 
 
 def fly(logger: MissionDataLogger, command: str, tmp_path: Path) -> str:
-    """A short mission, by the guide's calls."""
+    """A short mission, with the calls of the guide."""
     csv = tmp_path / 'trajectory.csv'
     csv.write_text('timestamp,x,y,yaw\n1,2,3,4\n')
     given = logger.start_mission('patrol', command)
@@ -110,7 +110,7 @@ def fly(logger: MissionDataLogger, command: str, tmp_path: Path) -> str:
 
 
 def check(server: Server, command: str, home: Path) -> None:
-    """All of ``fly`` is in MLflow and in the store, with its own times."""
+    """Everything from ``fly`` is in MLflow and in the store, with its times."""
     run = server.run(command)
     (folder,) = [folder for folder in missions(home) if (found := folder.run()) and found.run_id == run.info.run_id]
     times = [line.record['t'] // 1_000_000 for line in read(folder.journal) if line.record]
@@ -135,7 +135,7 @@ def check(server: Server, command: str, home: Path) -> None:
 
 @pytest.mark.seaweedfs
 def test_a_mission_is_in_mlflow_and_in_the_store(server: Server, warm_home: Path, tmp_path: Path) -> None:
-    """All of it, and the id that start_mission gave is the run's."""
+    """Completely, and the id from start_mission is the run's."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     given = fly(logger, 'whole', tmp_path)
     report = logger.close(60.0)
@@ -169,7 +169,7 @@ def test_a_run_is_running_while_its_mission_is(server: Server, warm_home: Path) 
 @pytest.mark.slow
 @pytest.mark.long('a kill')
 def test_a_mission_arrives_although_tower_was_unreachable_throughout(server: Server, home: Path, tmp_path: Path) -> None:
-    """No call waits for it; when it is back, after the robot's next start, the run is whole with the original times."""
+    """No call waits for it; once it is reachable again, after a restart of the robot, the run is complete with original times."""
     server.wire.set(HANG)
     logger = MissionDataLogger(home=home, start_timeout_s=0.3)
     began = time.monotonic()
@@ -177,7 +177,7 @@ def test_a_mission_arrives_although_tower_was_unreachable_throughout(server: Ser
     logger.close()
     assert time.monotonic() - began < 5.0
     assert (home / MISSIONS / given / 'journal').is_file()
-    until(lambda: read_json(home / MISSIONS / 'replay.json').get('errors'), 'the replayer says what is wrong')
+    until(lambda: read_json(home / MISSIONS / 'replay.json').get('errors'), 'the sender reports the error')
     os.kill(read_json(home / MISSIONS / 'replay.json')['pid'], signal.SIGKILL)  # the robot is switched off
     server.wire.set(PASS)
     again = MissionDataLogger(home=home)
@@ -193,7 +193,7 @@ def test_a_mission_arrives_although_tower_was_unreachable_throughout(server: Ser
 @pytest.mark.seaweedfs
 @pytest.mark.long('a kill')
 def test_a_killed_agents_mission_is_complete_and_killed(server: Server, home: Path, tmp_path: Path) -> None:
-    """One run, KILLED at its last record; each point and frame that a call had returned for is there, and once."""
+    """One run, KILLED at its last record; each point and frame of a call that returned is there, once."""
     csv = tmp_path / 'trajectory.csv'
     csv.write_text('timestamp,x,y,yaw\n')
     server.wire.set(REFUSE)
@@ -230,7 +230,7 @@ def test_a_killed_agents_mission_is_complete_and_killed(server: Server, home: Pa
 @pytest.mark.seaweedfs
 @pytest.mark.long('an outage of some seconds')
 def test_a_wrong_password_costs_no_mission(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mission waits, and reports the reason; once the right one is in ~/.mlflow/credentials it is sent, without a restart."""
+    """The mission waits, and reports the reason; once ~/.mlflow/credentials has the correct one it is sent, without a restart."""
     user, password = (os.environ[name] for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'))
     for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'):
         monkeypatch.delenv(name)
@@ -247,7 +247,7 @@ def test_a_wrong_password_costs_no_mission(server: Server, home: Path, tmp_path:
         logger.start_mission('patrol', 'with a wrong password')
         logger.log_metric('a', 1.0, step=0)
         logger.end_mission(True, 1.0, 1.0)
-        wrong = until(lambda: read_json(home / MISSIONS / 'replay.json').get('errors'), 'the sender says what is wrong')
+        wrong = until(lambda: read_json(home / MISSIONS / 'replay.json').get('errors'), 'the sender reports the error')
         assert 'MLFLOW_TRACKING_PASSWORD' in wrong['tracking']['remedy']
         assert 'mistyped' not in str(wrong) + (home / MISSIONS / 'replay.log').read_text()
         assert not complete(home)
@@ -258,7 +258,7 @@ def test_a_wrong_password_costs_no_mission(server: Server, home: Path, tmp_path:
 
 @pytest.mark.seaweedfs
 def test_a_second_run_is_closed_where_it_may_not_be_deleted(server: Server) -> None:
-    """A robot deletes nothing on a Tower with passwords: the run stays, ended and tagged, and is not taken for the mission's."""
+    """A robot has no permission to delete on a Tower with passwords: the run stays, ended and tagged, and is not used."""
     tracking = MlflowTracking(server.wire.url, 'thor_missions')
     run = tracking.run_of('twice', 'patrol', 1, {})
     second = server.client.create_run(run.experiment_id, start_time=0, tags={MISSION_TAG: 'twice'})
@@ -270,7 +270,7 @@ def test_a_second_run_is_closed_where_it_may_not_be_deleted(server: Server) -> N
 
 @pytest.mark.seaweedfs
 def test_an_experiment_that_a_robot_may_not_create_is_named(server: Server) -> None:
-    """The mission waits for it, and the remedy names who creates it."""
+    """The mission waits for it, and the remedy names the role that creates it."""
     with pytest.raises(TrackingUnavailable, match=r'^there is no experiment of_another') as caught:
         MlflowTracking(server.wire.url, 'of_another').run_of('patrol_1', 'patrol', 1, {})
     assert 'make tower-secrets' in caught.value.remedy
@@ -279,7 +279,7 @@ def test_an_experiment_that_a_robot_may_not_create_is_named(server: Server) -> N
 @pytest.mark.seaweedfs
 def test_artifacts_in_s3_need_an_endpoint(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If artifacts are in S3, the error names the missing variable, and with it they arrive."""
-    uri = f'file://{tmp_path}/mlruns'  # a Tower's own server does not allow this
+    uri = f'file://{tmp_path}/mlruns'  # a Tower does not allow this
     MlflowTracking(uri, '').open()
     type(server.client)(uri).create_experiment('in s3', artifact_location='s3://sensor-data/mlflow')
     tracking = MlflowTracking(uri, 'in s3')
@@ -317,7 +317,7 @@ def test_a_file_that_a_proxy_never_takes_is_refused(server: Server, tmp_path: Pa
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('mode', [REFUSE, HANG, (200, 'Portal'), (403, 'Forbidden'), (500, 'Broken'), (404, 'Elsewhere')])
 def test_an_invalid_server_is_retried(server: Server, mode: str | tuple[int, str]) -> None:
-    """Whatever answers, or does not: the mission waits, and the error has a remedy and no password."""
+    """Whatever it responds, if at all: the mission waits, and the error has a remedy and no password."""
     server.wire.set(mode)
     tracking = MlflowTracking(server.wire.url.replace('//', '//thor:very@secret@'), 'thor_missions')
     with pytest.raises(TrackingUnavailable) as caught:
@@ -336,7 +336,7 @@ needs_postgres = pytest.mark.skipif(not POSTGRES, reason='PostgreSQL is not inst
 
 @pytest.fixture
 def running() -> Iterator[ExitStack]:
-    """Ends what a test starts."""
+    """Stops the processes that a test starts."""
     with ExitStack() as stack:
         yield stack
 
@@ -346,7 +346,7 @@ def clean() -> dict[str, str]:
 
 
 def postgres_uri(running: ExitStack) -> str:
-    """The URI of an empty PostgreSQL, which does not run as root and so may need another user's folder."""
+    """The URI of an empty PostgreSQL, which refuses to run as root and so may need another user's folder."""
     assert POSTGRES
     folder = Path(running.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
     programs, as_user = Path(POSTGRES).resolve().parent, ()
@@ -392,7 +392,7 @@ def served(running: ExitStack, folder: Path, programs: Path, backend: str) -> st
 
 
 def voyage(folder: Path, programs: Path, uri: str) -> dict[str, Any]:
-    """What the server has of a mission that was sent twice by this environment's MLflow."""
+    """The server's data of a mission that was sent twice by this environment's MLflow."""
     tests = str(Path(__file__).parents[1])
     path = os.pathsep.join((tests, str(Path(tests).parent), os.environ.get('PYTHONPATH', '')))
     environ = clean() | {
@@ -408,7 +408,7 @@ def voyage(folder: Path, programs: Path, uri: str) -> dict[str, Any]:
 
 
 def check_voyage(found: dict[str, Any]) -> None:
-    """One run, each point once, texts whole but for what no database takes."""
+    """One run, each point once, texts complete except for characters that no database accepts."""
     assert found['status'] == 'FINISHED'
     assert found['steps'] == list(range(VOYAGE_POINTS))
     assert found['params'] == {
@@ -423,7 +423,7 @@ def check_voyage(found: dict[str, Any]) -> None:
 @pytest.mark.long('half a minute each, with servers of its own')
 @needs_postgres
 def test_missions_arrive_at_a_server_with_postgresql(running: ExitStack, tmp_path: Path) -> None:
-    """As a Tower has it."""
+    """As on a Tower."""
     check_voyage(voyage(tmp_path, HERE, served(running, tmp_path, HERE, postgres_uri(running))))
 
 
@@ -456,5 +456,4 @@ def test_missions_arrive_with_version_2_on_both_sides(running: ExitStack, tmp_pa
 @pytest.mark.long('half a minute each, with servers of its own')
 @needs_two
 def test_missions_arrive_in_a_local_file_of_version_2(tmp_path: Path) -> None:
-    """A SQLite file."""
     check_voyage(voyage(tmp_path, Path(TWO) / 'bin', f'sqlite:///{tmp_path}/mlflow.db'))

@@ -35,7 +35,7 @@ def frame_of(home: Path, value: Any) -> bytes:
     JPEG, bytearray(JPEG), memoryview(JPEG), np.frombuffer(JPEG, np.uint8), np.frombuffer(JPEG, np.uint8)[:, None],
 ], ids=['bytes', 'bytearray', 'memoryview', 'array', 'column'])  # fmt: skip
 def test_a_jpeg_is_stored_unchanged(tmp_path: Path, value: Any) -> None:
-    """Whatever holds its bytes; OpenCV's encoder gives an array."""
+    """From any type that holds its bytes; OpenCV's encoder returns an array."""
     assert frame_of(tmp_path, value) == JPEG
 
 
@@ -68,7 +68,7 @@ def test_gray_pixels_that_begin_as_a_jpeg_does_are_pixels(tmp_path: Path, value:
 def test_data_that_is_not_an_image_is_refused_at_the_call(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, value: Any, remedy: str
 ) -> None:
-    """It is counted by its reason, and the warning says what to do."""
+    """It is counted by reason, and the warning has the remedy."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_camera_frame(value, 3)
@@ -81,7 +81,7 @@ def test_data_that_is_not_an_image_is_refused_at_the_call(
     np.array([2.5]), np.array([[2.5]]), np.array(2.5), np.float32(2.5), np.float64(2.5), np.array([2.5], np.float16), 2.5,
 ])  # fmt: skip
 def test_one_element_is_a_number(tmp_path: Path, value: Any) -> None:
-    """Of any shape and precision, as a value; a whole one as a step."""
+    """Of any shape and precision, as a value; an integer as a step."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_metric('a', value, np.array([3]))  # type: ignore[arg-type]

@@ -1,6 +1,6 @@
 """A mission that is sent to the tracking server of the environment, with this Python's MLflow, and sent again as after a kill.
 
-``python -m missions.voyage FOLDER`` prints as JSON what the server has of it then.
+``python -m missions.voyage FOLDER`` prints the server's data of it as JSON.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ POINTS = 1200
 
 
 def fly(home: Path) -> None:
-    """Texts that some databases do not like, and more points than one batch takes."""
+    """Texts that are difficult for some databases, and more points than one batch takes."""
     with journalling(home, frame_artifact_every_s=0.0) as logger:
         logger.start_mission('patrol', 'Küche\0 \N{DOG FACE} ' + 'x' * 7000)
         for number in range(POINTS):
@@ -31,7 +31,7 @@ def fly(home: Path) -> None:
 
 
 def send(home: Path) -> Delivery:
-    """All of it, twice: the second time as by a sender that was killed before it noted how far it was."""
+    """All of it, twice: the second time as by a sender that was killed before it recorded its progress."""
     (folder,) = missions(home)
     tracking, spooler = open_tracking(home, 'thor_missions'), FakeSpooler()
     for _ in range(2):
@@ -43,7 +43,7 @@ def send(home: Path) -> Delivery:
 
 
 def poll(client: Any) -> dict[str, Any]:
-    """Artifacts by their own store: the list of the 3.17 client asks for models as well, which a server of 2.x does not know."""
+    """Artifacts by a direct request: the list of the 3.17 client also requests models, which a server of 2.x does not have."""
     from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
     experiment = client.get_experiment_by_name('thor_missions')

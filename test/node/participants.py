@@ -1,4 +1,4 @@
-"""Programs that take part in ROS, in the process of the test: each is a separate DDS participant."""
+"""ROS participants in the test's process: each is a separate DDS participant."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
 
 
 class Participant:
-    """A node with publishers, one a topic; ``end`` leaves as a program does that ends. A participant has one type for a topic.
+    """A node with one publisher per topic; ``end`` leaves as a program does when it exits. A participant has one type per topic.
 
-    Where no topic is said, its only publisher is meant.
+    Without a topic argument its only publisher is used.
     """
 
     def __init__(self, name: str, domain: int) -> None:
         self.name = f'/{name}'
         self._context = rclpy.Context()
-        with dead_ports_avoided(domain):  # as each of our programs: other tests kill nodes meanwhile
+        with dead_ports_avoided(domain):  # as in each of our programs: other tests kill nodes at the same time
             rclpy.init(args=[], context=self._context, domain_id=domain)
             self.node = Node(name, context=self._context, start_parameter_services=False, enable_rosout=False)
         self._publishers: dict[str, Any] = {}
@@ -33,11 +33,11 @@ class Participant:
         self._publishers[topic] = self.node.create_publisher(message_class, topic, profile)
 
     def matched(self, topic: str = '') -> int:
-        """How many subscriptions it is matched with."""
+        """The number of matched subscriptions."""
         return int(self._of(topic).get_subscription_count())
 
     def publish(self, *messages: Any, topic: str = '', period_s: float = 0.0) -> None:
-        """Messages, serialized or not; returns when the last one is out."""
+        """Publish messages, serialized or not; returns when the last one is sent."""
         publisher, due_s = self._of(topic), time.monotonic()
         for message in messages:
             time.sleep(max(0.0, due_s - time.monotonic()))
@@ -45,7 +45,7 @@ class Participant:
             publisher.publish(message)
 
     def leave(self, topic: str = '') -> None:
-        """Publish it no more."""
+        """Destroy its publisher."""
         publisher = self._of(topic)
         self.node.destroy_publisher(publisher)
         self._publishers = {name: other for name, other in self._publishers.items() if other is not publisher}

@@ -1,4 +1,4 @@
-"""A control socket without a node: requests are done by a thread of the test, as the node's main thread does them."""
+"""A control socket without a node: a thread of the test executes requests as the node's main thread does."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Do = Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
 class Serving:
-    """Open from the start; ``close`` any number of times. ``asked`` is what was asked for, ``hold`` keeps it from being done."""
+    """Open from the start; ``close`` any number of times. ``asked`` lists the requests, ``hold`` delays their execution."""
 
     def __init__(self, spool: Path, robot: str = 'thor', do: Do | None = None, **limits: float) -> None:
         spool.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Notifications to systemd, over a socket like its own."""
+"""Notifications to systemd, over a socket like systemd's."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shadowhound_data_logger.node.node import SystemdService
 
 @pytest.fixture
 def systemd(tmp_path: Path) -> Iterator[socket.socket]:
-    """The other end."""
+    """The receiving end."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(tmp_path / 'notify'))
         receiver.settimeout(5.0)
@@ -26,7 +26,7 @@ def _environ(receiver: socket.socket, **more: str) -> dict[str, str]:
 
 
 def test_systemd_is_notified_of_ready_and_stopping(systemd: socket.socket) -> None:
-    """Readiness comes with what it logs, and the end is announced."""
+    """Readiness includes what is logged, and the stop is announced."""
     service = SystemdService(_environ(systemd))
     service.ready('logging /odom')
     assert systemd.recv(1000) == b'READY=1\nSTATUS=logging /odom'
@@ -35,7 +35,7 @@ def test_systemd_is_notified_of_ready_and_stopping(systemd: socket.socket) -> No
 
 
 def test_the_watchdog_is_pinged_several_times_per_interval(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Turning the loop fifty times in two thirds of the interval is told three times."""
+    """Running the loop fifty times in two thirds of the interval pings three times."""
     now = 100.0
     monkeypatch.setattr('shadowhound_data_logger.node.node.time.monotonic', lambda: now)
     service = SystemdService(_environ(systemd, WATCHDOG_USEC='30000000', WATCHDOG_PID=str(os.getpid())))
@@ -51,7 +51,7 @@ def test_the_watchdog_is_pinged_several_times_per_interval(systemd: socket.socke
 
 @pytest.mark.parametrize('more', [{}, {'WATCHDOG_USEC': '30000000', 'WATCHDOG_PID': '1'}, {'WATCHDOG_USEC': 'soon'}])
 def test_without_a_watchdog_nothing_is_sent(systemd: socket.socket, more: dict[str, str]) -> None:
-    """Without a watchdog, or with one of another process, nothing is sent."""
+    """Nor with a watchdog of another process."""
     service = SystemdService(_environ(systemd, **more))
     service.alive()
     systemd.setblocking(False)
@@ -60,14 +60,14 @@ def test_without_a_watchdog_nothing_is_sent(systemd: socket.socket, more: dict[s
 
 
 def test_child_processes_do_not_notify_systemd(systemd: socket.socket) -> None:
-    """The variables are gone from the environment that children inherit."""
+    """The variables are removed from the environment that children inherit."""
     environ = _environ(systemd, WATCHDOG_USEC='1000000', WATCHDOG_PID=str(os.getpid()), HOME='/root')
     SystemdService(environ)
     assert environ == {'HOME': '/root'}
 
 
 def test_an_unreachable_systemd_is_not_a_failure(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A socket that is gone is said once, and logging goes on; without systemd nothing is said at all."""
+    """A missing socket is logged once, and the node continues; without systemd nothing is logged."""
     service = SystemdService({'NOTIFY_SOCKET': str(tmp_path / 'gone')})
     service.ready('x')
     service.stopping()

@@ -1,4 +1,4 @@
-"""Parameters of a real node: how they are described, which can be changed while it runs, and how a wrong one is refused."""
+"""Parameters of a real node: their descriptions, which can be changed at run time, and how invalid values are refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GIVEN = {'sensors': ['camera', 'mine'], 'mine.topics': ['mine'], 'camera.rate_hz
 
 @pytest.fixture(scope='module')
 def node() -> Iterator[Node]:
-    """One node for all tests: what they set they do not rely on."""
+    """One node for all tests, which do not depend on the values that others set."""
     context = Context()
     with free_domain() as domain:
         rclpy.init(context=context, domain_id=domain)
@@ -52,7 +52,7 @@ def sensor(settings: Settings | None, name: str = 'camera') -> SensorSettings:
 
 @pytest.mark.parametrize(('section', 'given'), [('/**', True), ('sensor_logger_node', True), ('sensor_loger_node', False)])
 def test_a_file_for_another_node_gives_nothing(tmp_path: Path, section: str, *, given: bool) -> None:
-    """A misspelt section is not an error to rcl: that nothing came is all that there is to know it by."""
+    """A misspelled section is not an error to rcl: the missing parameters are the only sign of it."""
     file = tmp_path / 'mine.yaml'
     file.write_text(f'{section}:\n  ros__parameters:\n    camera:\n      rate_hz: 2.0\n')
     context = Context()
@@ -65,7 +65,7 @@ def test_a_file_for_another_node_gives_nothing(tmp_path: Path, section: str, *, 
 
 
 def test_every_setting_is_a_parameter(node: Node, loaded: tuple[Parameters, Settings]) -> None:
-    """Those of a sensor of one's own too, with the values in use; sensors that are not used have none."""
+    """Including those of a custom sensor, with the values in use; unused sensors have none."""
     names = node.get_parameters_by_prefix('')
     for name in ('robot', 'sensors', 'queue.max_bytes', 'camera.quality', 'mine.rate_hz', 'mine.types'):
         assert name in names
@@ -76,7 +76,7 @@ def test_every_setting_is_a_parameter(node: Node, loaded: tuple[Parameters, Sett
 
 @pytest.mark.parametrize('name', ['camera.rate_hz', 'camera.quality', 'mine.enabled', 'queue.max_bytes', 'robot'])
 def test_every_parameter_is_described(node: Node, loaded: tuple[Parameters, Settings], name: str) -> None:
-    """With its help text, whether it was set in the file or not; what is not live is read-only and says what to do."""
+    """With its help text, set in the file or not; settings that cannot be changed at run time are read-only and say why."""
     descriptor = node.describe_parameter(name)
     assert descriptor.description
     assert descriptor.read_only is (name not in live(loaded[1]))
@@ -84,7 +84,7 @@ def test_every_parameter_is_described(node: Node, loaded: tuple[Parameters, Sett
 
 
 def test_the_ranges_are_those_of_the_settings(node: Node, loaded: tuple[Parameters, Settings]) -> None:
-    """No default lies outside, and an open end is the largest number there is."""
+    """No default is outside, and an open range ends at the largest number."""
     assert loaded
     (quality,) = node.describe_parameter('camera.quality').integer_range
     assert (quality.from_value, quality.to_value) == (1, 100)
@@ -100,7 +100,7 @@ def test_the_ranges_are_those_of_the_settings(node: Node, loaded: tuple[Paramete
     [('rate_hz', 5.0), ('rate_hz', 7), ('quality', 60), ('priority', 0), ('enabled', False), ('enabled', True)],
 )
 def test_a_live_parameter_is_changed(node: Node, loaded: tuple[Parameters, Settings], name: str, value: float) -> None:
-    """The settings are read once more, with the new value, which may be a whole number for a fraction."""
+    """The settings are read again with the new value, which may be an integer for a float."""
     result = node.set_parameters_atomically([Parameter(f'camera.{name}', value=value)])
     assert result.successful, result.reason
     assert getattr(sensor(loaded[0].changed()), name) == value
@@ -108,7 +108,7 @@ def test_a_live_parameter_is_changed(node: Node, loaded: tuple[Parameters, Setti
 
 
 def test_the_cap_of_the_upload_is_changed(node: Node, loaded: tuple[Parameters, Settings]) -> None:
-    """So is a setting that belongs to no sensor."""
+    """Settings that belong to no sensor can be changed, too."""
     assert node.set_parameters_atomically([Parameter('upload.max_mbps', value=2.5)]).successful
     settings = loaded[0].changed()
     assert settings
@@ -131,7 +131,7 @@ def test_the_cap_of_the_upload_is_changed(node: Node, loaded: tuple[Parameters, 
 def test_a_wrong_value_is_refused(
     node: Node, loaded: tuple[Parameters, Settings], name: str, value: object, words: tuple[str, ...]
 ) -> None:
-    """With the name, the value and what is allowed; what was in force stays."""
+    """With the name, the value and what is allowed; the old value stays in effect."""
     before = node.get_parameter(name).value
     result = node.set_parameters_atomically([Parameter(name, value=value)])
     assert not result.successful
@@ -141,7 +141,7 @@ def test_a_wrong_value_is_refused(
 
 
 def test_several_are_set_together_or_not_at_all(node: Node, loaded: tuple[Parameters, Settings]) -> None:
-    """One that is refused refuses the others of the same call, our own and those of ROS itself."""
+    """One refused parameter refuses all others of the call, ours and those of ROS itself."""
     good = Parameter('camera.priority', value=9)
     for bad in (Parameter('mine.rate_hz', value=1e-9), Parameter('use_sim_time', value='maybe')):
         assert not node.set_parameters_atomically([good, bad]).successful
@@ -162,7 +162,7 @@ def test_a_live_parameter_is_not_deleted(node: Node, loaded: tuple[Parameters, S
 
 @pytest.mark.parametrize('other', ['/mine', 'mine', '/talk'])
 def test_two_sensors_with_one_topic_stop_the_start(other: str) -> None:
-    """Also under two names for it, with and without the slash or by a remapping: each topic has one sensor."""
+    """Also under two names, with and without the slash or by a remapping: each topic has one sensor."""
     context = Context()
     given = {'sensors': ['first', 'second'], 'first.topics': ['mine'], 'second.topics': [other]}
     with free_domain() as domain:

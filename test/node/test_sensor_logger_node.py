@@ -1,4 +1,4 @@
-"""The node's command line: what is not an argument of ROS is refused before anything starts."""
+"""The node's command line: arguments that do not belong to ROS are refused before anything starts."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from shadowhound_data_logger.node.sensor_logger_node import main
 
 @pytest.fixture(autouse=True)
 def variables(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The RMW that the node would listen through is not that of the tests after it."""
+    """Keep the RMW chosen by the node from affecting later tests."""
     monkeypatch.setattr(os, 'environ', os.environ.copy())
 
 
 @pytest.mark.parametrize('arguments', [['--params-file', 'my.yaml'], ['camera.rate_hz:=2.0', '--ros-args', '-r', '__ns:=/a']])
 def test_arguments_that_ros_would_ignore_are_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    """Exit code 2, the argument by its name, and where it belongs: rcl would run with the defaults and say nothing."""
+    """Exit code 2, the argument by name, and where it belongs: rcl would silently run with the defaults."""
     assert main(arguments) == 2
     said = capsys.readouterr().err
     assert f'{arguments[0]!r} is not a valid argument' in said
@@ -26,6 +26,6 @@ def test_arguments_that_ros_would_ignore_are_refused(arguments: list[str], capsy
 
 @pytest.mark.parametrize('option', ['-h', '--help'])
 def test_help_starts_nothing(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Who asks how to use it is told, with exit code 0, and no node runs."""
+    """Help is printed with exit code 0, and no node runs."""
     assert main([option]) == 0
     assert capsys.readouterr().out.startswith('usage: sensor_logger_node')

@@ -1,4 +1,4 @@
-"""Ports of Fast DDS in shared memory (SharedMemGlobal.hpp), and what a listener leaves there that is killed."""
+"""Ports of Fast DDS in shared memory (SharedMemGlobal.hpp), and the state that a killed listener leaves there."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SETTLED = IN_USE | WAITING
 
 
 class Port:
-    """The memory of a port, as Fast DDS has it."""
+    """The memory of a port, in the layout of Fast DDS."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -47,11 +47,11 @@ class Port:
         return self._memory[self._first]
 
     def seem_to_process(self) -> None:
-        """As whoever takes a message says it."""
+        """As a listener that processes a message."""
         self._memory[self._first] = DEAD
 
     def be_marked_in_the_middle(self) -> None:
-        """As Fast DDS marks it, while a publisher that found it in order waits for its lock."""
+        """As Fast DDS marks it, while a publisher that found it healthy waits for its lock."""
         word = ctypes.c_char.from_buffer(self._memory, self._lock)
         assert self._libc.pthread_mutex_lock(ctypes.byref(word)) == 0
         time.sleep(0.3)
@@ -60,22 +60,22 @@ class Port:
 
 
 def ports_of(process: int) -> list[Port]:
-    """Those that it listens at: it has their locks."""
+    """The ports of a process: it holds their locks."""
     return [Port(path) for path in locked(process, r'port\d+')]
 
 
 def locked(process: int, name: str) -> list[Path]:
-    """Files of Fast DDS in shared memory with such a name, whose lock the process holds."""
+    """Files of Fast DDS in shared memory with such a name and a lock held by the process."""
     lock = re.compile(rf'({FOLDER}/fast(?:dds|rtps)_{name})_el')
     found = []
     for each in Path(f'/proc/{process}/fd').iterdir():
-        with suppress(FileNotFoundError):  # closed meanwhile
+        with suppress(FileNotFoundError):  # closed in the meantime
             found.append(lock.fullmatch(str(each.readlink())))
     return [Path(match[1]) for match in found if match]
 
 
 def seem_to_process(process: int, ports: Iterable[Port]) -> None:
-    """Stop it, and leave in its ports what it leaves that is killed while it processes a message."""
+    """Stop it, and leave its ports as if it were killed while it processes a message."""
     os.kill(process, signal.SIGSTOP)
     time.sleep(0.1)
     for port in ports:

@@ -1,4 +1,4 @@
-"""A publisher, or who listens to it, as a process: ``publisher_and_listener.py publisher|listener|guarded FILE``."""
+"""A publisher or a subscriber as a process: ``publisher_and_listener.py publisher|listener|guarded FILE``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def publish(count: Path) -> None:
-    """Without end, a byte in the file for each message."""
+    """Publish in an endless loop, with a byte in the file for each message."""
     with dead_ports_avoided(rclpy.utilities.get_default_context().get_domain_id()):
         node = rclpy.create_node('publisher')
     publisher = node.create_publisher(UInt8MultiArray, TOPIC, QOS)
@@ -31,7 +31,7 @@ def publish(count: Path) -> None:
 
 
 def listen(heard: Path, *, is_guarded: bool) -> None:
-    """The file is there once it hears."""
+    """The file is created with the first message."""
     with dead_ports_avoided(rclpy.utilities.get_default_context().get_domain_id()):
         node = rclpy.create_node('listener')
     guard = PortGuard() if is_guarded else None

@@ -1,4 +1,4 @@
-"""Which subscriptions a topic gets, from what its publishers offer."""
+"""The subscriptions of a topic, from the QoS that its publishers offer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RELIABLE, BEST_EFFORT, LATCHED = (True, False), (False, False), (True, True)
 
 
 def planned(*publishers: tuple[bool, bool]) -> list[tuple[bool, bool]]:
-    """(reliable, transient_local) of the subscriptions to publishers of these qualities."""
+    """(reliable, transient_local) of the subscriptions for publishers with this QoS."""
     found = [Endpoint(str(number), TYPE, *quality) for number, quality in enumerate(publishers)]
     return [(plan.reliable, plan.transient_local) for plan in plans('/topic', TYPE, found, DEPTH)]
 
@@ -25,28 +25,28 @@ def planned(*publishers: tuple[bool, bool]) -> list[tuple[bool, bool]]:
         ([BEST_EFFORT], [BEST_EFFORT]),
         ([LATCHED], [LATCHED]),
         ([BEST_EFFORT, RELIABLE], [RELIABLE, BEST_EFFORT]),
-        ([LATCHED, RELIABLE], [LATCHED, RELIABLE]),  # one that asks for TRANSIENT_LOCAL does not hear the other
+        ([LATCHED, RELIABLE], [LATCHED, RELIABLE]),  # one with TRANSIENT_LOCAL does not match the other
         ([LATCHED, RELIABLE, BEST_EFFORT], [LATCHED, RELIABLE, BEST_EFFORT]),
         ([LATCHED, BEST_EFFORT], [LATCHED, BEST_EFFORT]),
-        ([(False, True)], [BEST_EFFORT]),  # there is nothing to repeat a history with
+        ([(False, True)], [BEST_EFFORT]),  # there is no history to repeat
     ],
 )
 def test_every_publisher_can_serve_one_of_the_subscriptions(
     publishers: list[tuple[bool, bool]], subscriptions: list[tuple[bool, bool]]
 ) -> None:
-    """There is one subscription for each kind of publisher, asking for no more than it offers."""
+    """There is one subscription for each kind of publisher, requesting no more than it offers."""
     assert planned(*publishers) == subscriptions
 
 
 def test_an_expected_topic_is_listened_to_both_ways() -> None:
-    """Before there is a publisher, whatever comes is matched from its first message on."""
+    """Before there is a publisher, any kind is matched from its first message on."""
     assert planned() == [RELIABLE, BEST_EFFORT]
 
 
 @pytest.mark.parametrize(
     ('named', 'current', 'published', 'logged'),
     [
-        ('', '', [], ''),  # nothing to subscribe with
+        ('', '', [], ''),  # no type to subscribe with
         (TYPE, '', [], TYPE),
         (TYPE, '', [OTHER, OTHER], TYPE),
         (TYPE, OTHER, [OTHER], TYPE),
@@ -61,7 +61,7 @@ def test_an_expected_topic_is_listened_to_both_ways() -> None:
     ],
 )
 def test_one_type_of_a_topic_is_logged(named: str, current: str, published: list[str], logged: str) -> None:
-    """The one that is named, whoever publishes what; else the one that is heard already, while it has a publisher."""
+    """The configured one, whatever is published; otherwise the one already received, while it has a publisher."""
     publishers = [Endpoint(str(number), name, *RELIABLE) for number, name in enumerate(published)]
     assert logged_type(publishers, named, current) == logged
 
@@ -70,12 +70,12 @@ def test_one_type_of_a_topic_is_logged(named: str, current: str, published: list
     (TYPE, 4000), ('sensor_msgs/msg/CompressedImage', 120), ('sensor_msgs/msg/Image', 32), ('my_msgs/msg/Unknown', 4000),
 ])  # fmt: skip
 def test_the_history_covers_a_stall(type_name: str, messages: int) -> None:
-    """Before anything is heard: two seconds at 2,000 Hz, of large messages at 60 Hz, within 32 MiB."""
+    """Before any message: two seconds at 2,000 Hz, of large messages at 60 Hz, within 32 MiB."""
     assert HistoryDepth(type_name).depth == messages
 
 
 @pytest.mark.parametrize(('type_name', 'size', 'rate_hz', 'messages'), [
-    (TYPE, 700, 50, 4000),  # as it is
+    (TYPE, 700, 50, 4000),  # unchanged
     (TYPE, 200, 5_000, 16_384), (TYPE, 40, 15_000, 32_768), (TYPE, 40, 1e6, 65_536),  # faster than most
     (TYPE, 4096, 15_000, 8192),  # faster, within 32 MiB
     (TYPE, 100_000, 10, 256),  # larger than most of its like
@@ -84,7 +84,7 @@ def test_the_history_covers_a_stall(type_name: str, messages: int) -> None:
     ('sensor_msgs/msg/Image', 921_656, 30, 32), ('sensor_msgs/msg/Image', 6_220_856, 30, 16),
 ])  # fmt: skip
 def test_the_history_is_sized_from_the_received_rate(type_name: str, size: int, rate_hz: float, messages: int) -> None:
-    """Two seconds of messages at the rate at which they come and of the size that they have; it settles at once and stays."""
+    """Two seconds of messages at the received rate and size; it settles immediately and stays."""
     history = HistoryDepth(type_name)
     depths = []
     for _ in range(5):
@@ -96,14 +96,14 @@ def test_the_history_is_sized_from_the_received_rate(type_name: str, size: int, 
 
 
 def test_a_full_history_grows() -> None:
-    """More came than it held, so nobody knows how much: it grows until it is no longer full."""
+    """It received more than its depth, so the loss is unknown: it grows until it is no longer full."""
     history = HistoryDepth(TYPE)
     history.observe([40] * 4000, 60.0)
     assert history.depth == 4096
 
 
 def test_a_stall_does_not_count_as_a_rate() -> None:
-    """What gathered while nobody took came in the whole time since the last drain; a first drain counts as one poll at least."""
+    """Messages accumulated during it count for the time since the last drain; a first drain counts as at least one poll."""
     history = HistoryDepth(TYPE)
     history.observe([40] * 3000, 1.5)
     assert history.depth == 4000
@@ -112,7 +112,7 @@ def test_a_stall_does_not_count_as_a_rate() -> None:
 
 
 def test_a_plan_is_logged_in_words() -> None:
-    """The log says how a topic is listened to."""
+    """The log describes the subscriptions of a topic."""
     assert (
         Plan('/odom', TYPE, reliable=True, transient_local=False, depth=400).describe() == f'/odom ({TYPE}, RELIABLE, depth 400)'
     )
@@ -122,7 +122,7 @@ def test_a_plan_is_logged_in_words() -> None:
 
 
 def test_a_single_publisher_is_the_sender() -> None:
-    """Where the middleware does not name the sender, the only publisher is it; of two nobody knows."""
+    """If the middleware does not name the sender, the only publisher is it; with two it is unknown."""
     senders = Senders()
     assert senders.name(1, 10) is None
     senders.poll(['a'])
@@ -133,7 +133,7 @@ def test_a_single_publisher_is_the_sender() -> None:
 
 
 def test_a_successor_is_distinguished_from_its_predecessor() -> None:
-    """Numbers that begin anew while time goes on are another publisher's, though the graph does not show it yet."""
+    """Numbers that restart while time continues belong to another publisher, though the graph does not show it yet."""
     senders = Senders()
     senders.poll(['a'])
     first = [senders.name(number, number * 10) for number in (1, 2, 3)]
@@ -143,7 +143,7 @@ def test_a_successor_is_distinguished_from_its_predecessor() -> None:
 
 
 def test_two_undiscovered_publishers_are_not_mistaken_for_a_gap() -> None:
-    """Numbers that begin anew and then go on where the old ones were come from two publishers: nobody's, and no loss of one."""
+    """Numbers that restart and later continue the old ones are from two publishers: no sender is known, and nothing is lost."""
     senders = Senders()
     senders.poll(['a'])
     assert None not in {senders.name(number, number * 10) for number in (1, 2, 3, 4, 5)}
@@ -152,7 +152,7 @@ def test_two_undiscovered_publishers_are_not_mistaken_for_a_gap() -> None:
 
 
 def test_a_successor_that_overtakes_its_predecessor_is_recognized() -> None:
-    """It is told apart for as long as it publishes, also when it loses a message after that."""
+    """It is distinguished while it publishes, also if it loses a message after that."""
     senders = Senders()
     senders.poll(['a'])
     first = {senders.name(number, number * 10) for number in (1, 2, 3)}

@@ -1,4 +1,4 @@
-"""What is asked of librcl directly agrees with what is so."""
+"""Values read from librcl directly are correct."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def node(domain: int) -> Iterator[Any]:
 
 
 def test_the_publishers_of_a_subscription_are_counted(node: Any) -> None:
-    """As they come and go, also where rclpy does not count them."""
+    """While they come and go, also if rclpy does not count them."""
     found = read(node, '/counted')
     handle = found._subscription.handle
     assert found.matched() == librcl.publisher_count(handle.pointer) == 0
@@ -49,13 +49,13 @@ def test_the_publishers_of_a_subscription_are_counted(node: Any) -> None:
 
 
 SIZES = (0, 1, 100, 3_000, 500_000, 7, 2_000_000, 20_000, 3)
-"""Of messages one after the other: the buffer has to grow, and not to tell what a longer one left in it."""
+"""For consecutive messages: the buffer must grow, and not return what a longer one left in it."""
 needs_fast_dds = pytest.mark.skipif(get_rmw_implementation_identifier() not in reader.FAST_DDS, reason='needs numbers')
 
 
 @pytest.fixture
 def through_librcl(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever this rclpy tells."""
+    """Whatever this rclpy provides."""
     monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', (99,))
     monkeypatch.setattr(reader, '_VERIFIED', {})
 
@@ -73,7 +73,7 @@ def drained(found: Reader, count: int) -> list[Taken]:
 @needs_fast_dds
 @pytest.mark.parametrize('latched', [False, True])
 def test_librcl_and_rclpy_agree(node: Any, monkeypatch: pytest.MonkeyPatch, *, latched: bool) -> None:
-    """Of each message of two publishers, small, large and small again: bytes, times, and what rclpy tells of who sent it."""
+    """For each message of two publishers, small, large and small again: bytes, times, and the sender that rclpy reports."""
     monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', ())
     by_rclpy = read(node, '/both', latched=latched)
     monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', (99,))
@@ -106,7 +106,7 @@ def test_librcl_and_rclpy_agree(node: Any, monkeypatch: pytest.MonkeyPatch, *, l
 @needs_fast_dds
 @pytest.mark.usefixtures('through_librcl')
 def test_takes_through_librcl_are_verified_once(node: Any, caplog: pytest.LogCaptureFixture) -> None:
-    """With messages of the node to itself, on a topic that is gone afterwards, and one line says so."""
+    """With the node's messages to itself, on a topic that is removed afterwards, and one log line."""
     caplog.set_level('INFO')
     readers = [read(node, f'/proved{number}') for number in range(3)]
     assert all(each._taker is not None for each in readers)
@@ -124,7 +124,7 @@ def test_takes_through_librcl_are_verified_once(node: Any, caplog: pytest.LogCap
 def test_librcl_is_used_where_rclpy_lacks_information(
     node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...], *, needs_librcl: bool
 ) -> None:
-    """Humble, Jazzy, and the Kilted of its first weeks: their rclpy does not tell whose a message is."""
+    """Humble, Jazzy, and early Kilted: their rclpy does not report the sender of a message."""
     monkeypatch.setattr(reader, 'rclpy_version', lambda: version)
     monkeypatch.setattr(reader, '_VERIFIED', {})
     assert reader.takes_through_librcl(node) is needs_librcl
@@ -132,7 +132,7 @@ def test_librcl_is_used_where_rclpy_lacks_information(
 
 @needs_fast_dds
 def test_rclpy_reports_what_its_version_should(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether a take through it names the publisher, which the bound rests on."""
+    """Whether its take reports the publisher, on which the version limit is based."""
     with monkeypatch.context() as patch:
         patch.setattr(reader, 'REPORTS_PUBLISHERS', ())
         found = read(node, '/told')
@@ -149,7 +149,7 @@ def test_rclpy_reports_what_its_version_should(node: Any, monkeypatch: pytest.Mo
 def test_an_empty_message_is_skipped(
     node: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, version: tuple[int, ...]
 ) -> None:
-    """Fast DDS gives one without end where it lost its place: the reader goes on with another subscription, and says so once."""
+    """Fast DDS returns endless ones if it lost its position: the reader switches to another subscription, and logs it once."""
     monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', version)
     found = read(node, '/stuck')
     publisher = node.create_publisher(String, '/stuck', 10)
@@ -169,7 +169,7 @@ def test_an_empty_message_is_skipped(
 
 
 def test_messages_before_an_empty_message_are_taken(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where no other subscription can be made, which the next drain tries again."""
+    """Also if no other subscription can be created, which the next drain retries."""
     found = read(node, '/refused')
     kept = found._subscription
     waiting = [Taken(b'cdr', 1, None, None, 1)]
@@ -195,7 +195,7 @@ def test_messages_before_an_empty_message_are_taken(node: Any, monkeypatch: pyte
 @needs_fast_dds
 @pytest.mark.parametrize('version', [(), (99,)])
 def test_messages_after_an_empty_message_are_taken(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...]) -> None:
-    """Anybody in the network may send some: they cost neither the messages behind them nor the subscription."""
+    """Any participant may send some: they cost neither the messages after them nor the subscription."""
     monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', version)
     found = read(node, '/hollow')
     before = found._subscription
@@ -210,7 +210,7 @@ def test_messages_after_an_empty_message_are_taken(node: Any, monkeypatch: pytes
 
 
 class EmptyHandle:
-    """Of a subscription that is stuck."""
+    """The handle of a stuck subscription."""
 
     pointer = 1
 
@@ -240,7 +240,7 @@ WRONG = {
 def test_incorrect_message_info_is_not_trusted(
     node: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    """Messages are taken through rclpy then, and one warning says why."""
+    """Messages are taken through rclpy then, and one warning has the reason."""
     take = librcl.Taker.take
     monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (told := take(*given)) and WRONG[what](librcl.RclMessage(*told)))
     readers = [read(node, f'/wrong{number}') for number in range(2)]
@@ -260,7 +260,7 @@ def test_incorrect_message_info_is_not_trusted(
 def test_a_librcl_without_the_functions_is_not_used(
     node: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As one of a distribution to come might be; with Cyclone DDS nothing is asked at all, as it has no numbers."""
+    """Such as one of a future distribution; with Cyclone DDS it is not called at all, since there are no numbers."""
 
     def missing() -> None:
         raise AttributeError('undefined symbol: rcutils_get_default_allocator')
@@ -276,7 +276,7 @@ def test_a_librcl_without_the_functions_is_not_used(
 @needs_fast_dds
 @pytest.mark.usefixtures('through_librcl')
 def test_overwritten_messages_are_a_gap_in_the_numbers(node: Any) -> None:
-    """Of what was published while nobody took, the last messages come, with their own numbers."""
+    """Of those published during a pause, the last messages arrive, with their numbers."""
     found = read(node, '/full', depth=5)
     publisher = node.create_publisher(String, '/full', 100)
     until(lambda: found.matched() == 1, 'it is matched')

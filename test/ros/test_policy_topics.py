@@ -1,4 +1,4 @@
-"""Nodes hear which policy is active, and send one out that breaks its limits; what is no word of health is counted."""
+"""Nodes receive the active policy, and roll back one that breaks its limits; invalid health messages are counted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shadowhound_data_logger.ros.policy_topics import MAX_HEALTH_BYTES, NODE, Po
 
 
 class Listener:
-    """A node of the robot: what it heard of ``~/policy``, and its own ``~/health``."""
+    """A node of the robot: the messages received on ``~/policy``, and its ``~/health``."""
 
     def __init__(self, context: rclpy.Context) -> None:
         self.node = Node('driver', context=context)
@@ -100,7 +100,7 @@ def test_a_policy_is_published_evaluated_and_rolled_back(scene: Scene, listener:
 def test_a_policy_that_cannot_be_evaluated_stays_active(
     scene: Scene, listener: Listener, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A manifest that is not there any more: the fault is told, and the topics go on."""
+    """With a missing manifest: the fault is reported, and the topics continue."""
     now = scene.folder.current()
     assert now is not None
     node = Node('judge', context=listener.node.context)

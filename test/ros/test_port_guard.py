@@ -1,4 +1,4 @@
-"""Ports of killed listeners: what is changed in them, what is left alone, and that publishers continue."""
+"""Ports of killed listeners: the changes to them, the exceptions, and that publishers continue."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def segment(
     *listeners: int, name: str = PORT, mutex: int = MUTEX, is_ok: bool = True, is_exclusive: bool = True, number: int = 0,
     counted: int | None = None, periods: tuple[int, int] = (1000, 333), abi: bytes = b'port_node_abi5',
 ) -> bytes:  # fmt: skip
-    """A port as Fast DDS makes it, with the flags of its first listeners."""
+    """A port as Fast DDS creates it, with the flags of its first listeners."""
     domain, port = name.split('_port')
     node = bytearray(CONDITION + 2 * mutex + 20 * LISTENERS + 24)
     struct.pack_into(
@@ -54,7 +54,7 @@ def shm(tmp_path: Path) -> Path:
 
 
 def leave(shm: Path, *listeners: int, name: str = PORT, has_lock: bool = True, **more: object) -> Path:
-    """A port that nobody holds."""
+    """A port without an owner."""
     path = shm / name
     path.write_bytes(segment(*listeners, name=name, **more))  # type: ignore[arg-type]
     if has_lock:
@@ -65,7 +65,7 @@ def leave(shm: Path, *listeners: int, name: str = PORT, has_lock: bool = True, *
 @pytest.mark.parametrize(('name', 'mutex'), [(PORT, MUTEX), ('fastdds_port17411', OTHER_MUTEX)])
 @pytest.mark.parametrize('flags', [DEAD, IN_USE, DEAD | WAITING])
 def test_a_dead_listener_is_marked_as_waiting(shm: Path, name: str, mutex: int, flags: int) -> None:
-    """It is one byte that changes, once, and only when it is asked for; on both machines, of both names."""
+    """Exactly one byte changes, once, and only on request; on both machines, for both names."""
     path = leave(shm, flags, name=name, mutex=mutex)
     before = path.read_bytes()
     assert settle(shm, dry_run=True) == [name]
@@ -77,7 +77,7 @@ def test_a_dead_listener_is_marked_as_waiting(shm: Path, name: str, mutex: int, 
 
 
 def test_running_listeners_are_left_alone(shm: Path) -> None:
-    """However busy it is, and also where Fast DDS has marked its port."""
+    """However busy it is, and also if Fast DDS has marked its port."""
     for is_ok in (True, False):
         path = leave(shm, DEAD, is_ok=is_ok)
         with flock(shm / f'{PORT}_el'):
@@ -86,7 +86,7 @@ def test_running_listeners_are_left_alone(shm: Path) -> None:
 
 
 def test_without_a_lock_only_marked_ports_are_changed(shm: Path) -> None:
-    """A publisher that stands still has removed the lock's file before."""
+    """A blocked publisher has removed the lock's file before."""
     path = leave(shm, DEAD, has_lock=False)
     assert settle(shm) == []
     path.write_bytes(segment(IN_USE, is_ok=False))
@@ -106,7 +106,7 @@ def test_without_a_lock_only_marked_ports_are_changed(shm: Path) -> None:
     ],
 )  # fmt: skip
 def test_an_unexpected_layout_is_left_alone(shm: Path, data: bytes) -> None:
-    """Another ABI, another architecture, numbers that do not fit together, half a port, two of them: not a byte is written."""
+    """Another ABI, another architecture, inconsistent numbers, half a port, two of them: not a byte is written."""
     path = leave(shm)
     path.write_bytes(data)
     os.utime(path, (0, 0))
@@ -117,7 +117,7 @@ def test_an_unexpected_layout_is_left_alone(shm: Path, data: bytes) -> None:
 def test_ports_of_other_programs_are_left_alone(
     shm: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Links, pipes, other names, and what belongs to another user."""
+    """Links, pipes, other names, and files of another user."""
     outside = tmp_path_factory.mktemp('outside') / PORT
     outside.write_bytes(segment(DEAD))
     (shm / PORT).symlink_to(outside)
@@ -136,7 +136,7 @@ def test_ports_of_other_programs_are_left_alone(
 
 @pytest.mark.parametrize(('data', 'told'), [(b'', b'\0'), (bytes(52400), b'\3\0\0\0'), (b'\1'.ljust(52400, b'\0'), b'\3\0\0\0')])
 def test_an_unfinished_port_is_abandoned(shm: Path, data: bytes, told: bytes) -> None:
-    """Who waits for it sees that it is damaged, and the next one makes another."""
+    """A waiting process finds that it is damaged, and the next one creates another."""
     path = leave(shm)
     path.write_bytes(data)
     assert settle(shm) == [], 'it may be in the making'
@@ -149,13 +149,13 @@ def test_an_unfinished_port_is_abandoned(shm: Path, data: bytes, told: bytes) ->
 
 
 def test_a_program_without_ports_has_no_guard(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is started, and the end of it is no trouble."""
+    """Nothing is started, and stopping it has no effect."""
     monkeypatch.setattr(subprocess, 'Popen', None)
     PortGuard().close()
 
 
 def test_an_operator_can_turn_it_off(monkeypatch: pytest.MonkeyPatch, shm: Path) -> None:
-    """No guard is started and no port is written to, although one is left that would be settled otherwise."""
+    """No guard is started and no port is written to, even one that would otherwise be fixed."""
     (shm / PORT).touch()
     left = time.time() - MAKING_S - 1
     os.utime(shm / PORT, (left, left))
@@ -177,7 +177,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 class Pair:
-    """A publisher, which counts what it has published in a file, and who listens to it."""
+    """A publisher, which counts its published messages in a file, and its subscriber."""
 
     def __init__(self, folder: Path, domain: int, *, is_guarded: bool) -> None:
         environ = {**os.environ, 'ROS_DOMAIN_ID': str(domain)}
@@ -193,13 +193,13 @@ class Pair:
             pytest.skip('this middleware has no ports in shared memory')
 
     def kill_listener(self) -> None:
-        """While it processes a message, as far as anybody can see."""
+        """Make it look as if killed while it processes a message."""
         seem_to_process(self.listener.pid, self.ports)
         self.listener.kill()
         self.listener.wait()
 
     def publishes(self, within_s: float = WAIT_S, but: Callable[[], object] = lambda: None) -> bool:
-        """``but`` undoes what the programs of other tests, which start meanwhile, settle."""
+        """``but`` undoes the changes of other tests' programs that start at the same time."""
         before, end = self._published(), time.monotonic() + within_s
         while time.monotonic() < end:
             but()
@@ -239,11 +239,11 @@ def pair(tmp_path: Path) -> Iterator[Callable[[bool], Pair]]:
 @pytest.mark.ros
 @pytest.mark.long('a kill')
 def test_a_blocked_publisher_continues(pair: Callable[[bool], Pair]) -> None:
-    """It does stand still without; should that fail, Fast DDS has been mended."""
+    """Without the guard it is blocked; should that fail, Fast DDS has been fixed."""
     two = pair(False)
     two.kill_listener()
     for port in two.ports:
-        port.seem_to_process()  # the program of another test may have settled it
+        port.seem_to_process()  # another test's program may have fixed it
         port.be_marked_in_the_middle()
     assert not two.publishes(5.0, but=lambda: [port.seem_to_process() for port in two.ports]), 'nothing stops it'
     settle()
@@ -253,7 +253,7 @@ def test_a_blocked_publisher_continues(pair: Callable[[bool], Pair]) -> None:
 @pytest.mark.ros
 @pytest.mark.long('a kill')
 def test_a_guard_acts_before_fast_dds_notices(pair: Callable[[bool], Pair]) -> None:
-    """So the publisher never stands still, at whatever moment Fast DDS marks the port."""
+    """So the publisher is never blocked, at whatever moment Fast DDS marks the port."""
     two = pair(True)
     assert two.publishes()
     two.kill_listener()

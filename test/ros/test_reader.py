@@ -1,4 +1,4 @@
-"""The reader of topics, and what it needs of rclpy beyond its documented interface (the list in ros/reader.py)."""
+"""The reader of topics, and its use of rclpy beyond the documented interface (the list in ros/reader.py)."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Meta(type):
 class IMU(metaclass=Meta):
     pass
 """
-"""As rosidl generates it, beside a library that is not found: PYTHONPATH is set, LD_LIBRARY_PATH is not."""
+"""As rosidl generates it, next to a missing library: PYTHONPATH is set, LD_LIBRARY_PATH is not."""
 
 
 def test_a_package_without_its_library_is_unavailable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is unavailable, as one that is not installed is; what rosidl raises is not an ImportError and would end the intake."""
+    """Like one that is not installed; rosidl's exception is not an ImportError and would end the intake."""
     (tmp_path / 'broken_interfaces').mkdir()
     (tmp_path / 'broken_interfaces/msg.py').write_text(BROKEN)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -53,7 +53,7 @@ def test_a_package_without_its_library_is_unavailable(tmp_path: Path, monkeypatc
 
 @pytest.mark.parametrize('layout', ['careless.py', 'careless/__init__.py'])
 def test_a_package_without_messages_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str) -> None:
-    """A neighbor that publishes a type of that name would have whatever is installed here run."""
+    """Otherwise any participant could make the node import an installed package by publishing a type with that name."""
     path = tmp_path / layout
     path.parent.mkdir(exist_ok=True)
     path.write_text('raise SystemExit("it was run")')
@@ -83,7 +83,7 @@ def test_a_package_without_messages_is_not_imported(tmp_path: Path, monkeypatch:
     ],
 )
 def test_an_invalid_type_is_reported_as_missing(name: str) -> None:
-    """Each is told as the package that is missing, whatever the import raised."""
+    """Each is reported as the missing package, whatever the import raised."""
     with pytest.raises(TypeUnavailable, match=name):
         message_class(name)
 
@@ -131,7 +131,7 @@ def never(_: bytes) -> None:
 
 @pytest.mark.ros
 def test_messages_are_taken_from_a_subscription(node: Any) -> None:
-    """Its handle is held, taken from by type and raw, has an address, and tells when the message was sent and came."""
+    """Its handle is acquired, taken from by type and raw, has an address, and reports when the message was sent and received."""
     group = PolledGroup()
     silent = SubscriptionEventCallbacks(use_default_callbacks=False)
     subscription = node.create_subscription(
@@ -152,7 +152,7 @@ def test_messages_are_taken_from_a_subscription(node: Any) -> None:
 
 @pytest.mark.ros
 def test_event_handlers_are_off_by_default(node: Any) -> None:
-    """A subscription that wants none has none: they would be in the wait set."""
+    """A subscription without any has none: they would be in the wait set."""
     silent = SubscriptionEventCallbacks(use_default_callbacks=False)
     subscription = node.create_subscription(String, '/silent', never, 5, callback_group=PolledGroup(), event_callbacks=silent)
     assert list(getattr(subscription, 'event_handlers', [])) == []
@@ -161,7 +161,7 @@ def test_event_handlers_are_off_by_default(node: Any) -> None:
 
 @pytest.mark.ros
 def test_a_callback_group_has_everything_that_an_executor_uses(node: Any) -> None:
-    """Rclpy's group has these methods and no other, with as many arguments as ours; ours keeps what is in it."""
+    """The group of rclpy has these methods and no others, with as many arguments as ours; ours keeps its contents."""
     group = PolledGroup()
     methods = {name for name, _ in inspect.getmembers(CallbackGroup, inspect.isfunction) if not name.startswith('_')}
     assert methods == {'add_entity', 'has_entity', 'can_execute', 'beginning_execution', 'ending_execution'}
@@ -177,5 +177,5 @@ def test_a_callback_group_has_everything_that_an_executor_uses(node: Any) -> Non
 @pytest.mark.ros
 @pytest.mark.skipif(rclpy.get_rmw_implementation_identifier() != 'rmw_fastrtps_cpp', reason='the layout is used with Fast DDS')
 def test_librcl_is_verified_on_this_distribution(node: Any) -> None:
-    """The proof of the start holds on this distribution, also where rclpy tells all and nobody needs it."""
+    """The check at startup succeeds on this distribution, also if rclpy reports everything."""
     assert verify_librcl(node) == ''

@@ -1,4 +1,4 @@
-"""Shared memory of killed processes: what is freed, and what is left alone."""
+"""Shared memory of killed processes: what is freed, and what is not changed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'fast_datasharing_01.0f.7
 
 @pytest.fixture
 def shm(tmp_path: Path) -> Path:
-    """Three segments with their locks, and what is none of ours, all of long ago but one."""
+    """Three segments with their locks, and foreign files, all old except one."""
     for name in (*OTHERS, *(f'{segment}{end}' for segment in (DEAD, ALIVE, YOUNG) for end in ('', '_el'))):
         (tmp_path / name).write_bytes(b'x' * 8192 if '_el' not in name else b'')
         os.utime(tmp_path / name, (0, 0))
@@ -32,7 +32,7 @@ def names(folder: Path) -> set[str]:
 
 
 def test_only_unowned_segments_are_freed(shm: Path) -> None:
-    """Not that of a process that lives or starts, nor ports, nor what has no lock; to look at them changes nothing."""
+    """Not that of a running or starting process, nor ports, nor one without a lock; checking them changes nothing."""
     before = names(shm)
     with flock(shm / f'{ALIVE}_el'):
         assert [each.name for each in orphans(shm)] == [DEAD]
@@ -43,7 +43,7 @@ def test_only_unowned_segments_are_freed(shm: Path) -> None:
 
 
 def test_segments_of_another_user_are_kept(shm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever may remove it: root, say."""
+    """Even if this process may remove it, as root may."""
     before, mine = names(shm), os.geteuid()
     monkeypatch.setattr(os, 'geteuid', lambda: mine + 1)
     assert orphans(shm, free=True) == []
@@ -51,7 +51,7 @@ def test_segments_of_another_user_are_kept(shm: Path, monkeypatch: pytest.Monkey
 
 
 def test_an_unrelated_lock_is_ignored(shm: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Anybody may write there: links are not followed, and a pipe holds nobody up."""
+    """Any user may write there: links are not followed, and a pipe does not block."""
     outside = tmp_path_factory.mktemp('outside') / 'file'
     outside.write_text('precious')
     os.utime(outside, (0, 0))
@@ -73,7 +73,7 @@ def test_without_the_folder_nothing_is_freed(tmp_path: Path) -> None:
 
 
 def ports(shm: Path, *numbers: int) -> list[str]:
-    """Ports of Fast DDS with their locks, which nobody has."""
+    """Ports of Fast DDS with their locks, without an owner."""
     names = [f'fastrtps_port{number}' for number in numbers]
     for name in names:
         (shm / name).write_bytes(b'x')
@@ -82,7 +82,7 @@ def ports(shm: Path, *numbers: int) -> list[str]:
 
 
 def process(proc: Path, number: int, *mapped: str) -> Path:
-    """One that has these files in its memory."""
+    """A process with these files mapped."""
     maps = proc / f'{number}' / 'maps'
     maps.parent.mkdir(parents=True)
     maps.write_text(''.join(f'7f00-7f01 rw-s 00000000 00:18 12 /dev/shm/{name}\n' for name in mapped))
@@ -95,7 +95,7 @@ def is_locked(shm: Path, name: str) -> bool:
 
 
 def test_a_dead_port_with_a_writer_is_avoided(tmp_path: Path) -> None:
-    """In this domain, also where the segment was replaced; not one that lives, and none that nobody has in memory."""
+    """In this domain, also if the segment was replaced; not one in use, and none that no process has mapped."""
     shm = tmp_path / 'shm'
     shm.mkdir()
     written, replaced, alive, forgotten, other = ports(shm, 7413, 7001, 7415, 7417, 7663)
@@ -111,7 +111,7 @@ def test_a_dead_port_with_a_writer_is_avoided(tmp_path: Path) -> None:
 
 
 def test_where_owners_are_unknown_all_ports_are_avoided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But so few that Fast DDS finds another one, and those that died last."""
+    """But so few that Fast DDS finds another one, the most recent first."""
     shm = tmp_path / 'shm'
     shm.mkdir()
     dead = ports(shm, *range(7411, 7651, 2))

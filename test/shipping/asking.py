@@ -24,7 +24,7 @@ KEEP = KeepSettings(poll_s=10.0)
 
 
 def frame(number: int, *, body: bytes = b'', **fields: Any) -> DataObject:
-    """A picture that stays on the robot, one a second."""
+    """An image that is kept on the robot, one per second."""
     stamp_ns = NOON_NS + number * SECOND
     said = {meta.ROBOT: 'thor', meta.POSE: f'{number} 0 0 odom', meta.SHIP: meta.ON_REQUEST, **fields.pop('metadata', {})}
     return make(f'thor/camera/20251018/{number:06d}_front.jpg', body or b'%06d' % number, t_start_ns=stamp_ns, t_end_ns=stamp_ns,
@@ -32,7 +32,7 @@ def frame(number: int, *, body: bytes = b'', **fields: Any) -> DataObject:
 
 
 class Desk:
-    """A robot with its spool and a store, and somebody who asks."""
+    """A robot with its spool and a store, and a client that requests data."""
 
     def __init__(self, root: Path, keep: KeepSettings = KEEP) -> None:
         self.root = root
@@ -48,7 +48,7 @@ class Desk:
         self.open()
 
     def open(self) -> None:
-        """The node starts."""
+        """Start the node."""
         self.spool = Spool(self.root, SpoolSettings(min_free_bytes=0), self.clock, 'thor', self.keep)
         self.spool.open()
         self.server = RequestServer(self.spool, self.store, self.keep, 'thor', self.clock, put=self._commit,
@@ -69,7 +69,7 @@ class Desk:
         assert self.spool.commit(items) == []
 
     def write(self, body: bytes) -> None:
-        """Somebody replaces the mailbox."""
+        """Replace the mailbox as a client does."""
         found = self.store.changed(MAILBOX_BUCKET, inbox_key('thor'), '', 1 << 30)
         assert found
         assert self.store.replace(MAILBOX_BUCKET, inbox_key('thor'), body, found[1])
@@ -88,7 +88,7 @@ class Desk:
         self.server.step()
 
     def deliver(self, most: int = 1000) -> int:
-        """The store takes what is pending."""
+        """Deliver pending objects to the store."""
         items = self.spool.pending(most)
         for item in items:
             self.store.put(item)
@@ -96,7 +96,7 @@ class Desk:
         return len(items)
 
     def answers(self, request: str) -> list[dict[str, Any]]:
-        """What the store has, in order."""
+        """The responses in the store, in order."""
         while self.deliver():
             pass
         found = [
@@ -106,7 +106,7 @@ class Desk:
         return sorted(found, key=lambda answer: answer['number'])
 
     def finish(self) -> None:
-        """Until nothing happens any more."""
+        """Continue until nothing changes."""
         for _ in range(60):
             self.step()
             self.deliver()

@@ -1,4 +1,4 @@
-"""Spools to ship from, and the rule that no upload thread outlives its test."""
+"""Spools to ship from, and a check that no upload thread is still running after its test."""
 
 from __future__ import annotations
 
@@ -33,5 +33,5 @@ def no_thread_is_left() -> Iterator[None]:
 
 @pytest.fixture
 def drive(spool: FakeSpool, clock: Time) -> Drive:
-    """A schedule with a spool and a clock by hand."""
+    """A schedule with a spool and a clock controlled by the test."""
     return Drive(spool, clock)

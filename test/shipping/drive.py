@@ -1,4 +1,4 @@
-"""A Schedule driven by hand, in the place of the threads."""
+"""A Schedule driven by the test, in place of the threads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CAP_S = 60.0
 
 
 class Drive:
-    """Plays the threads: looks where the schedule says so, and hands out what it would ship."""
+    """Acts as the threads: polls when the schedule requires it, and returns the objects it would ship."""
 
     def __init__(self, spool: FakeSpool, clock: Time, threads: int = 2) -> None:
         self.spool = spool
@@ -31,7 +31,7 @@ class Drive:
                             pending(OLDEST, exclude=poll.exclude, without=poll.without, oldest=True))  # fmt: skip
 
     def next(self) -> SpooledObject | None:
-        """What is shipped now, None when there is only rest."""
+        """The object shipped now; None if the threads only wait."""
         for _ in range(10):
             step = self.schedule.step()
             if isinstance(step, Ship):
@@ -42,7 +42,7 @@ class Drive:
         raise AssertionError('it looks again and again')
 
     def wait(self) -> SpooledObject:
-        """What is shipped next, the clock going on as far as it takes."""
+        """The object shipped next, advancing the clock as needed."""
         for _ in range(1000):
             if item := self.next():
                 return item
@@ -65,5 +65,5 @@ class Drive:
         return ruling.quarantine
 
     def said(self) -> list[tuple[Verdict, str | None, bool]]:
-        """(what, bucket, whether it is over) of each notice."""
+        """(what, bucket, whether it has ended) of each notice."""
         return [(notice.verdict, notice.bucket, notice.lasted_s is not None) for notice in self.notices]

@@ -14,7 +14,7 @@ from shadowhound_data_logger.shipping.uploader import Uploader
 
 
 class FakeSpool:
-    """What Uploader asks of a spool, and what its writer does with outcomes."""
+    """The part of the spool that Uploader uses, including outcomes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -55,7 +55,7 @@ class FakeSpool:
         yield self.lock_is_free
 
     def settle(self, outcomes: Sequence[Outcome]) -> None:
-        """Durable at once, as after a group commit."""
+        """Durable immediately, as after a group commit."""
         with self._lock:
             self.outcomes += outcomes
             for outcome in outcomes:
@@ -69,7 +69,7 @@ class FakeSpool:
 
 
 class Time:
-    """Seconds that pass when told to."""
+    """A clock in seconds that advances only when the test says so."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -79,7 +79,7 @@ class Time:
 
 
 def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait for something that another thread does; a deadline that is missed is a failure."""
+    """Wait for something that another thread does; a missed deadline is a failure."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, 'it did not happen in time'

@@ -1,4 +1,4 @@
-"""New data and a backlog are delivered next to each other, also by a store that is too slow for both."""
+"""New data and a backlog are delivered side by side, also by a store that is too slow for both."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shadowhound_data_logger.shipping.ahead import LIVE
 
 
 def shipped(drive: Drive, count: int) -> list[SpooledObject]:
-    """The next so many, each delivered at once."""
+    """The next objects, each delivered immediately."""
     found = []
     for _ in range(count):
         item = drive.next()
@@ -25,7 +25,7 @@ def shipped(drive: Drive, count: int) -> list[SpooledObject]:
 
 
 def test_new_objects_are_sent_next_to_a_backlog(drive: Drive) -> None:
-    """Every second turn, as long as some is there: in turns the most important, and the priority that waits for the longest."""
+    """Every second turn, while there are any: alternately the most important, and the priority that has waited the longest."""
     old = drive.spool.add(200, priority=2)
     drive.schedule.wake(clouds := drive.spool.add(3, priority=7))
     drive.schedule.wake(poses := drive.spool.add(2, priority=3))
@@ -35,7 +35,7 @@ def test_new_objects_are_sent_next_to_a_backlog(drive: Drive) -> None:
 
 
 def test_live_data_keep_up_while_a_backlog_is_delivered(drive: Drive) -> None:
-    """At a tenth of the store's rate the newest are delivered at once, and the backlog gets the rest."""
+    """At a tenth of the store's rate the newest are delivered immediately, and the backlog gets the rest."""
     old = {item.id for item in drive.spool.add(1000, priority=2)}
     waited = []
     for _ in range(50):
@@ -47,14 +47,14 @@ def test_live_data_keep_up_while_a_backlog_is_delivered(drive: Drive) -> None:
 
 
 def test_only_a_few_of_the_newest_are_remembered(drive: Drive) -> None:
-    """More at once than are remembered are delivered all the same, in the other orders."""
+    """More than are remembered at the same time are delivered in the other orders."""
     drive.schedule.wake(new := drive.spool.add(10 * LIVE))
     assert Counter(item.id for item in shipped(drive, len(new))) == Counter(item.id for item in new)
     assert drive.next() is None
 
 
 def test_a_new_object_is_claimed_once(drive: Drive) -> None:
-    """Told of as new after a look has found it already, it is not shipped twice."""
+    """An object announced as new after a poll has found it is not shipped twice."""
     (item,) = drive.spool.add()
     assert drive.next() == item
     drive.schedule.wake([item])
@@ -64,7 +64,7 @@ def test_a_new_object_is_claimed_once(drive: Drive) -> None:
 
 
 def test_a_new_object_of_a_bucket_that_takes_nothing_waits(drive: Drive) -> None:
-    """It is not tried before the bucket's next probe, and goes on as soon as that gets through."""
+    """It is not tried before the bucket's next probe, and is sent as soon as that succeeds."""
     (first,) = drive.spool.add()
     assert drive.next() == first
     drive.fail(first, BucketMissing('no such bucket'))
@@ -76,7 +76,7 @@ def test_a_new_object_of_a_bucket_that_takes_nothing_waits(drive: Drive) -> None
 
 
 def test_new_objects_do_not_probe_an_unreachable_store(drive: Drive) -> None:
-    """One object is tried at a time, whatever comes."""
+    """One object is tried at a time, whatever arrives."""
     (first,) = drive.spool.add()
     assert drive.next() == first
     drive.fail(first, StoreUnavailable('Tower is away'))
@@ -89,7 +89,7 @@ def test_new_objects_do_not_probe_an_unreachable_store(drive: Drive) -> None:
 
 
 LIVE_PRIORITY = (3, 3, 4, 6, 7)
-"""Priorities of the objects that are made each second, all at one instant."""
+"""Priorities of the objects created each second, all at the same time."""
 SECONDS = 90
 IDS = ('more important', 'less important', 'alike')
 LONG = pytest.mark.long('a second of CPU or more')
@@ -97,17 +97,17 @@ LONG = pytest.mark.long('a second of CPU or more')
 
 @dataclass(slots=True)
 class Shared:
-    """Who was served while a backlog was drained."""
+    """The deliveries while a backlog was drained."""
 
     old: list[int] = field(default_factory=list)
-    """Priorities of what was delivered of the backlog."""
+    """Priorities of the delivered backlog objects."""
     live: Counter[int] = field(default_factory=Counter)
-    """Priority -> objects delivered of those that were made meanwhile."""
+    """Priority -> delivered objects among those created in that time."""
     waits_s: list[float] = field(default_factory=list)
 
 
 def share(drive: Drive, backlog: tuple[int, ...], per_s: float) -> Shared:
-    """A store that takes ``per_s`` objects a second, for a minute and a half; the backlog has these priorities, over and over."""
+    """A store that accepts ``per_s`` objects per second, for 90 s; the backlog cycles through these priorities."""
     for place in range(1200):
         drive.spool.add(priority=backlog[place % len(backlog)])
     found, made = Shared(), dict[int, float]()
@@ -132,7 +132,7 @@ def share(drive: Drive, backlog: tuple[int, ...], per_s: float) -> Shared:
 
 @pytest.mark.parametrize('backlog', [pytest.param((3,), marks=LONG), pytest.param((9,), marks=LONG), (3, 4, 6, 7, 9)], ids=IDS)
 def test_a_store_of_twice_the_rate_keeps_up_with_what_is_live(drive: Drive, backlog: tuple[int, ...]) -> None:
-    """Whatever lies in the backlog, all that is made meanwhile is there within two seconds, and the rest is the backlog's."""
+    """Whatever the backlog contains, each new object is delivered within two seconds, and the backlog gets the rest."""
     found = share(drive, backlog, per_s=2 * len(LIVE_PRIORITY))
     assert found.live.total() >= len(LIVE_PRIORITY) * (SECONDS - 2)
     assert max(found.waits_s) <= 2.0
@@ -142,9 +142,9 @@ def test_a_store_of_twice_the_rate_keeps_up_with_what_is_live(drive: Drive, back
 @LONG
 @pytest.mark.parametrize(('backlog', 'least'), [((3,), 1 / 2), ((9,), 1 / 8), ((3, 4, 6, 7, 9), 1 / 2)], ids=IDS)
 def test_a_store_that_is_too_slow_is_shared_evenly(drive: Drive, backlog: tuple[int, ...], least: float) -> None:
-    """Every second turn is that of the live ones, of which no priority goes without; the oldest of the backlog go on leaving.
+    """Every second turn is for live objects, with no priority starved; the oldest of the backlog continue to be sent.
 
-    What was made meanwhile and could not be delivered soon is backlog as well, and may be more important than the old.
+    New objects that could not be delivered soon become backlog as well, and may be more important than the old.
     """
     found = share(drive, backlog, per_s=len(LIVE_PRIORITY) * 0.8)
     turns = len(found.old) + found.live.total()
@@ -155,7 +155,7 @@ def test_a_store_that_is_too_slow_is_shared_evenly(drive: Drive, backlog: tuple[
 
 
 def test_without_a_backlog_every_turn_is_live(drive: Drive) -> None:
-    """Nothing is kept free for what is not there."""
+    """No turns are reserved for a missing backlog."""
     for _ in range(20):
         new = [item for priority in LIVE_PRIORITY for item in drive.spool.add(priority=priority)]
         drive.schedule.wake(new)

@@ -1,4 +1,4 @@
-"""An audit of every store requests each delivered object, and finds whatever happened to it since."""
+"""An audit of every store checks each delivered object, and finds any change since its delivery."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def remove(store: ObjectStore, item: SpooledObject) -> None:
 
 
 def overwrite(store: ObjectStore, item: SpooledObject, body: bytes, *, metadata: bool = True) -> None:
-    """Other content under the key, with the metadata of the object or with none."""
+    """Put other content under the key, with the metadata of the object or without any."""
     said = dict(item.metadata) if metadata else {}
     if isinstance(store, MemoryStore):
         info = ObjectInfo(item.bucket, item.key, len(body), said.get('sha256'), said)
@@ -71,7 +71,7 @@ def kinds(found: Audit) -> dict[str, list[str]]:
 
 
 def test_delivered_objects_are_found(store: ObjectStore, spooled: Spool, bucket: str) -> None:
-    """Nothing is found where nothing happened; what has not been delivered is not asked for, and nothing stays behind."""
+    """Without changes there are no findings; undelivered objects are not checked, and no state is left behind."""
     items = deliver(spooled, store, bucket, 'a', 'b', 'c')
     pending, evicted, twin = put(spooled, *(make(f'thor/{name}', bucket=bucket) for name in ('p', 'e', 't')))
     settle(spooled, evicted, State.EVICTED, 'disk')
@@ -84,7 +84,7 @@ def test_delivered_objects_are_found(store: ObjectStore, spooled: Spool, bucket:
 
 
 def test_an_audit_skips_parts_of_the_catalog(spooled: Spool) -> None:
-    """They go once a larger part stands for them: one that is gone is not a finding, and none is counted."""
+    """Catalog parts are removed once a larger part replaces them: a missing one is not a finding, and none is counted."""
     store = MemoryStore()
     part = replace(make('thor/_catalog/date=2026-11-21/a.parquet'), sensor='_catalog', topic=None, samples=0)
     settle(spooled, *put(spooled, part), State.DELIVERED)
@@ -93,7 +93,7 @@ def test_an_audit_skips_parts_of_the_catalog(spooled: Spool) -> None:
 
 
 def test_every_change_of_an_object_is_found(store: ObjectStore, spooled: Spool, bucket: str) -> None:
-    """Deleted, cut, replaced by other content or by another program: each is named for what it is."""
+    """Deleted, truncated, replaced by other content or by another program: each has its finding."""
     names = ('deleted', 'cut', 'changed', 'foreign', 'same', 'good')
     deleted, cut, changed, foreign, same, _ = deliver(spooled, store, bucket, *names)
     remove(store, deleted)
@@ -110,7 +110,7 @@ def test_every_change_of_an_object_is_found(store: ObjectStore, spooled: Spool, 
 
 
 class Failing(MemoryStore):
-    """A memory store that answers so many requests and then fails."""
+    """A memory store that serves this many requests and then fails."""
 
     def __init__(self, store: MemoryStore, answers: int, error: StoreError) -> None:
         super().__init__()
@@ -139,7 +139,7 @@ def paged(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures('paged')
 @pytest.mark.parametrize('error', [StoreUnavailable('away'), CredentialsRejected('wrong key')])
 def test_an_interrupted_audit_resumes(spooled: Spool, error: StoreError) -> None:
-    """A store that goes away is not a finding; the next run asks for the rest, for what came since, and for what was found."""
+    """An unreachable store is not a finding; the next run checks the rest, new objects, and earlier findings."""
     store = MemoryStore()
     items = deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(45)))
     remove(store, items[3])
@@ -154,12 +154,12 @@ def test_an_interrupted_audit_resumes(spooled: Spool, error: StoreError) -> None
     assert first.sound + found.sound == 45
     assert set(second.asked) >= {items[3].key, items[44].key, later[0].key}
     assert len(second.asked) <= 46 - 29
-    assert verify(spooled, store).asked == 46, 'what came to its end begins anew'
+    assert verify(spooled, store).asked == 46, 'a completed audit starts again'
 
 
 @pytest.mark.usefixtures('paged')
 def test_another_audit_starts_again(spooled: Spool) -> None:
-    """One that was cut short is forgotten on request, and by one that asks otherwise."""
+    """An interrupted one is discarded on request, and by an audit with other options."""
     store = MemoryStore()
     deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(30)))
     for options in ({'again': True}, {'deep': True}):
@@ -168,7 +168,7 @@ def test_another_audit_starts_again(spooled: Spool) -> None:
 
 
 def test_a_transient_failure_of_the_store_is_retried(spooled: Spool) -> None:
-    """A request that is throttled now and then is not a reason to end."""
+    """A request that is throttled occasionally does not end the audit."""
     store = MemoryStore()
     deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(30)))
     asked = iter(range(1000))
@@ -182,7 +182,7 @@ def test_a_transient_failure_of_the_store_is_retried(spooled: Spool) -> None:
 
 
 def test_an_answer_of_another_server_is_not_a_finding(spooled: Spool) -> None:
-    """Where somebody else answers that there is no such object, the probe tells, and nothing is said of the object."""
+    """If another server responds that the object does not exist, the probe detects it, and there is no finding for the object."""
     store = MemoryStore(lambda item: None if item else StoreUnavailable('does not answer like an S3 server'))
     items = deliver(spooled, store, 'bucket', 'a', 'b')
     remove(store, items[0])
@@ -191,7 +191,7 @@ def test_an_answer_of_another_server_is_not_a_finding(spooled: Spool) -> None:
 
 
 def test_an_object_that_is_denied_is_a_finding(spooled: Spool) -> None:
-    """Without the right to list, a server says so of what is not there as well: it is listed, and the others go on."""
+    """Without the right to list, a server also denies missing objects: the object is listed, and the others are checked."""
     store = MemoryStore()
     deliver(spooled, store, 'bucket', 'a', 'b')
 
@@ -206,7 +206,7 @@ def test_an_object_that_is_denied_is_a_finding(spooled: Spool) -> None:
 
 
 def test_all_findings_are_counted_and_the_first_are_listed(spooled: Spool) -> None:
-    """A lost bucket does not fill the memory or the screen."""
+    """A lost bucket fills neither the memory nor the screen."""
     store = MemoryStore()
     for item in deliver(spooled, store, 'bucket', *(f'{number:02d}' for number in range(KEYS + 5))):
         remove(store, item)
@@ -216,7 +216,7 @@ def test_all_findings_are_counted_and_the_first_are_listed(spooled: Spool) -> No
 
 
 def test_metadata_that_was_changed_is_found(spooled: Spool) -> None:
-    """A checksum that is not the delivered one, be the content as it may."""
+    """A checksum that is not the delivered one is found, whatever the content."""
     store = MemoryStore()
     (item,) = deliver(spooled, store, 'bucket', 'a')
     info, body = store._objects[item.bucket, item.key]

@@ -30,7 +30,7 @@ from shadowhound_data_logger.spool.spool import Spool
 
 
 class Hand:
-    """A clock that is moved by hand, in seconds."""
+    """A clock in seconds that the test moves."""
 
     def __init__(self) -> None:
         self.s = 0.0
@@ -51,7 +51,7 @@ def clock() -> FakeClock:
 
 @pytest.fixture
 def spool(root: Path, clock: FakeClock) -> Iterator[Spool]:
-    """An open spool, empty."""
+    """An open, empty spool."""
     opened = new_spool(root, clock)
     opened.open()
     yield opened
@@ -85,13 +85,13 @@ def lines(body: bytes) -> list[dict[str, Any]]:
 
 
 def keys(part: DataObject) -> list[str]:
-    """Of the rows in a part."""
+    """The keys of the rows in a part."""
     assert isinstance(part.body, bytes)
     return [row['key'] for row in lines(part.body)]
 
 
 def test_every_delivered_object_has_one_row(spool: Spool, root: Path, catalog: CatalogWriter) -> None:
-    """Not before, not again, and the parts have none."""
+    """Not before delivery and never twice; parts have no rows."""
     items = put(spool, *map(of, 'abc'))
     assert catalog.parts() == []
     deliver(spool, items[:2])
@@ -107,7 +107,7 @@ def test_every_delivered_object_has_one_row(spool: Spool, root: Path, catalog: C
 
 
 def test_a_part_is_named_and_kept_like_bookkeeping(spool: Spool, catalog: CatalogWriter) -> None:
-    """Its key has date, time and boot; it is Parquet, protected, and says how many rows it has."""
+    """Its key has date, time and boot; it is Parquet, protected, and records its number of rows."""
     delivered(spool, 'a', 'b')
     (part,) = catalog.parts()
     assert check_key(part.key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567.jsonl.zst'
@@ -118,7 +118,7 @@ def test_a_part_is_named_and_kept_like_bookkeeping(spool: Spool, catalog: Catalo
 
 
 def test_parts_are_separate_for_each_robot_and_date(spool: Spool, catalog: CatalogWriter) -> None:
-    """Whoever delivers for several robots, or after midnight, writes a part for each; one without a name goes to this robot."""
+    """When delivering for several robots, or after midnight, there is a part for each; without a name it is this robot's."""
     delivered(spool, 'a', metadata={'robot': 'tachi'})
     delivered(spool, 'b', t_start_ns=NOON_NS + 86_400 * 10**9, metadata={'robot': 'thor'})
     delivered(spool, 'c', metadata={'robot': '../thor'})
@@ -131,7 +131,7 @@ def test_parts_are_separate_for_each_robot_and_date(spool: Spool, catalog: Catal
 
 
 def test_one_part_is_written_per_period(spool: Spool, clock: FakeClock) -> None:
-    """At once what an earlier process left; then nothing before the period is over, and all of it afterwards."""
+    """Immediately what an earlier process left; then nothing before the end of the period, and everything after it."""
     hand = Hand()
     catalog = made(spool, clock, hand, period_s=60.0)
     delivered(spool, 'a')
@@ -152,7 +152,7 @@ def test_one_part_is_written_per_period(spool: Spool, clock: FakeClock) -> None:
 
 
 def test_a_backlog_continues_at_the_next_poll(spool: Spool, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After an outage parts of a bounded size follow one another without waiting for the next period."""
+    """After an outage parts of bounded size follow one another without waiting for the next period."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MAX_ROWS', 2)
     hand = Hand()
     catalog = made(spool, clock, hand, period_s=60.0)
@@ -166,7 +166,7 @@ def test_a_backlog_continues_at_the_next_poll(spool: Spool, clock: FakeClock, mo
 
 
 def test_pending_rows_are_not_taken_again(spool: Spool, root: Path, catalog: CatalogWriter) -> None:
-    """While a full disk keeps a part back, the next one has what is new only."""
+    """While a full disk delays a part, the next one has only new rows."""
     delivered(spool, 'a')
     first = catalog.parts()
     delivered(spool, 'b')
@@ -180,7 +180,7 @@ def test_pending_rows_are_not_taken_again(spool: Spool, root: Path, catalog: Cat
 
 
 def test_the_memory_of_pending_parts_is_small(spool: Spool, catalog: CatalogWriter) -> None:
-    """After an outage they have thousands of rows: memory grows with the rows, not with their square."""
+    """After an outage they have thousands of rows: memory grows linearly with the rows."""
     delivered(spool, *map(str, range(600)))
     tracemalloc.start()
     made = catalog.parts()
@@ -191,7 +191,7 @@ def test_the_memory_of_pending_parts_is_small(spool: Spool, catalog: CatalogWrit
 
 
 def test_two_processes_catalog_one_spool_without_repeats(spool: Spool, root: Path, clock: FakeClock) -> None:
-    """A node and an agent, or a node that was killed and its successor: whose part is committed first counts."""
+    """A node and an agent, or a killed node and its successor: the part committed first counts."""
     delivered(spool, 'a', 'b')
     ours, theirs = made(spool, clock).parts(), made(spool, clock).parts()
     assert [keys(part) for part in ours] == [keys(part) for part in theirs] == [['a', 'b']]
@@ -201,7 +201,7 @@ def test_two_processes_catalog_one_spool_without_repeats(spool: Spool, root: Pat
 
 
 def test_rows_skipped_by_a_part_are_in_the_next(spool: Spool, root: Path, clock: FakeClock) -> None:
-    """A part that came second for some of its rows is none; what nobody else took is handed out again, without a restart."""
+    """A part whose rows were partly taken is discarded; the rows not taken are listed again, without a restart."""
     delivered(spool, 'a')
     theirs = made(spool, clock).parts()
     delivered(spool, 'b')
@@ -214,7 +214,7 @@ def test_rows_skipped_by_a_part_are_in_the_next(spool: Spool, root: Path, clock:
 
 
 def test_a_repeat_has_a_separate_row(spool: Spool, root: Path, catalog: CatalogWriter) -> None:
-    """Content that was not stored again is found at its own time, under the key that holds it."""
+    """Content that was not stored again is found at its time, under the key of the stored object."""
     first, later = (make(f'thor/camera/{second}.jpg', t_start_ns=NOON_NS + second, t_end_ns=NOON_NS + second, dedup=True,
                          metadata={'robot': 'thor'}) for second in (0, 1))  # fmt: skip
     deliver(spool, put(spool, first))
@@ -231,7 +231,7 @@ def test_a_repeat_has_a_separate_row(spool: Spool, root: Path, catalog: CatalogW
 
 
 def test_without_a_catalog_nothing_piles_up(spool: Spool, clock: FakeClock) -> None:
-    """With ``catalog.enabled: false`` there are no parts, and when it is switched on later, only of what comes then."""
+    """With ``catalog.enabled: false`` there are no parts; enabled later, parts have only objects from then on."""
     delivered(spool, 'a')
     off, on = made(spool, clock, enabled=False), made(spool, clock)
     assert off.parts() == []
@@ -241,7 +241,7 @@ def test_without_a_catalog_nothing_piles_up(spool: Spool, clock: FakeClock) -> N
 
 
 def test_statistics_are_in_separate_parts_once_the_object_is_delivered(spool: Spool, catalog: CatalogWriter) -> None:
-    """A row for each field and one for the object; of what is evicted, and of what has none, nothing."""
+    """One row per field and one for the object; none for evicted objects or those without statistics."""
     said = {name: FieldStatistics() for name in 'ab'}
     said['a'].add([{'x': 1.5}, {'x': None}])
     said['b'].add([{'x': 9.0}])
@@ -265,7 +265,7 @@ def test_statistics_are_in_separate_parts_once_the_object_is_delivered(spool: Sp
 def test_statistics_of_many_objects_go_into_several_parts(
     spool: Spool, catalog: CatalogWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each in one part, under names that differ: all of them at once would take more memory than the rows do."""
+    """Each in one part, under different names: all at the same time would take more memory than the rows."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.OBJECTS_A_PART', 2)
     said = FieldStatistics()
     said.add([{'x': 1.5}])
@@ -297,7 +297,7 @@ def told(parts: list[DataObject]) -> list[dict[str, Any]]:
 
 
 def hear(spool: Spool, *numbers: int, topic: str = CAMERA) -> None:
-    """Messages with these numbers, a tenth of a second apart."""
+    """Receive messages with these numbers, 0.1 s apart."""
     with spool.accounts.entry(topic) as account:
         for number in numbers:
             account.receive('p', number, by_arrival(NOON_NS + number * SECOND // 10))
@@ -308,7 +308,7 @@ def hear(spool: Spool, *numbers: int, topic: str = CAMERA) -> None:
 
 
 def store(spool: Spool, name: str, state: State = State.DELIVERED, **fields: Any) -> SpooledObject:
-    """An object of one message, delivered or what became of it."""
+    """An object of one message, delivered or with another outcome."""
     (item,) = spool.commit([make(name, name.encode(), **fields)])
     if state is not State.PENDING:
         spool.commit(outcomes=[Outcome(item, state, 'AccessDenied' if state is State.QUARANTINED else None)])
@@ -320,7 +320,7 @@ def what(rows: list[dict[str, Any]]) -> list[tuple[str, str | None, int | None, 
 
 
 def test_gaps_are_reported_once_before_their_watermark(spool: Spool, root: Path) -> None:
-    """A row for the gap, one up to where all is known; and no part while nothing changes."""
+    """A row for the gap, one for the watermark; and no part while nothing changes."""
     hear(spool, 1)
     store(spool, 'a')
     hear(spool, 6)
@@ -336,7 +336,7 @@ def test_gaps_are_reported_once_before_their_watermark(spool: Spool, root: Path)
 
 
 def test_another_process_continues_after_durable_parts(spool: Spool, root: Path) -> None:
-    """What a process handed out and did not spool is told by the next; what it spooled is not told again."""
+    """What a process listed and did not spool is reported by the next; what it spooled is not reported again."""
     hear(spool, 1, 6)
     spool.commit()
     lost_with_its_process = writer(root).parts()
@@ -350,7 +350,7 @@ def test_another_process_continues_after_durable_parts(spool: Spool, root: Path)
 
 
 def test_a_late_message_withdraws_its_gap(spool: Spool, root: Path) -> None:
-    """The same name, a higher revision."""
+    """The same name with a higher revision."""
     catalog = writer(root)
     hear(spool, 1, 3)
     spool.commit()
@@ -362,7 +362,7 @@ def test_a_late_message_withdraws_its_gap(spool: Spool, root: Path) -> None:
 
 
 def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path) -> None:
-    """While an object waits it may be evicted; quarantined it is told, retried the watermark goes back before it."""
+    """A pending object may be evicted; a quarantined one is reported, and on a retry the watermark moves back before it."""
     hear(spool, 1)
     store(spool, 'a')
     hear(spool, 20)
@@ -382,7 +382,7 @@ def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path)
 
 
 def test_no_watermark_overtakes_its_gaps(spool: Spool, root: Path) -> None:
-    """While a part with gaps is on its way, or refused, the store must not hear that all is known."""
+    """While a part with gaps is pending, or refused, the store must not get a watermark beyond them."""
     catalog = writer(root)
     hear(spool, 1, 6)
     item = store(spool, 'a', State.PENDING, samples=2)
@@ -399,7 +399,7 @@ def test_no_watermark_overtakes_its_gaps(spool: Spool, root: Path) -> None:
 
 
 def test_gaps_of_another_date_are_reported_before_the_watermark(spool: Spool, root: Path) -> None:
-    """They are parts of their own, of which any may come first."""
+    """They are separate parts, which may arrive in any order."""
     catalog = writer(root)
     hear(spool, 1)
     store(spool, 'a')
@@ -411,7 +411,7 @@ def test_gaps_of_another_date_are_reported_before_the_watermark(spool: Spool, ro
 
 
 def test_gaps_of_a_lost_part_are_reported_again(spool: Spool, root: Path) -> None:
-    """Somebody deleted its file before it was delivered."""
+    """Its file was deleted before it was delivered."""
     catalog = writer(root)
     hear(spool, 1, 6)
     spool.commit()
@@ -423,7 +423,7 @@ def test_gaps_of_a_lost_part_are_reported_again(spool: Spool, root: Path) -> Non
 
 
 def test_a_full_disk_keeps_the_parts(root: Path) -> None:
-    """None is evicted, nor left out: what they told would not be told again."""
+    """None is evicted or skipped: their statements would not be reported again."""
     spool = new_spool(root, FakeClock(), max_bytes=1)
     spool.open()
     catalog = writer(root)
@@ -437,7 +437,7 @@ def test_a_full_disk_keeps_the_parts(root: Path) -> None:
 
 
 def test_resending_reports_all_remembered_gaps(spool: Spool, root: Path) -> None:
-    """Where the store lost its parts: every gap, and the watermark behind them."""
+    """If the store lost its parts: every gap, followed by the watermark."""
     catalog = writer(root)
     hear(spool, 1, 6)
     store(spool, 'a', samples=2)
@@ -450,14 +450,14 @@ def test_resending_reports_all_remembered_gaps(spool: Spool, root: Path) -> None
     assert told(again) == before
     assert catalog.parts() == [], 'once'
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(again)])
-    assert [row['what'] for row in told(writer(root).parts())] == ['complete'], 'a new process does not begin anew'
+    assert [row['what'] for row in told(writer(root).parts())] == ['complete'], 'a new process does not start again'
     assert resend_gaps(root) == 1
     assert len(told(writer(root).parts())) == len(before), 'also where no process ran when it was asked'
 
 
 @pytest.mark.parametrize('is_of_older_version', [False, True])
 def test_resent_watermarks_exclude_forgotten_gaps(spool: Spool, root: Path, is_of_older_version: bool) -> None:
-    """The store may have lost what the robot forgot: it would be taken for all that was lost."""
+    """The store may have lost what the robot forgot: those times would be taken for free of losses."""
     hear(spool, 20)
     store(spool, 'a')
     hear(spool, 26, 27, 28)
@@ -468,7 +468,7 @@ def test_resent_watermarks_exclude_forgotten_gaps(spool: Spool, root: Path, is_o
         if is_of_older_version:
             spool._connections.writing._db.execute('UPDATE gaps SET to_ns = NULL WHERE begin_ns = ?', (FORGOTTEN,))
     (mark,) = told(writer(root).parts())
-    assert (mark['from_ns'], mark['to_ns']) == (NOON_NS + SECOND * 2, NOON_NS + SECOND * 28 // 10), 'it was told'
+    assert (mark['from_ns'], mark['to_ns']) == (NOON_NS + SECOND * 2, NOON_NS + SECOND * 28 // 10), 'it was reported'
     resend_gaps(root)
     (mark,) = told(writer(root).parts())
     begin_ns = NOON_NS + (SECOND * 2 if is_of_older_version else SECOND * 26 // 10)
@@ -478,7 +478,7 @@ def test_resent_watermarks_exclude_forgotten_gaps(spool: Spool, root: Path, is_o
 
 
 def test_no_watermark_covers_unreported_forgotten_gaps(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows beyond the bound of the journal go, told or not: where they were, nobody knows what was lost."""
+    """Rows beyond the journal's limit are removed, reported or not: the losses there are unknown."""
     hear(spool, 20)
     store(spool, 'a')
     hear(spool, 26, 27, 28)
@@ -497,7 +497,7 @@ def test_no_watermark_covers_unreported_forgotten_gaps(spool: Spool, root: Path,
 
 
 def test_a_killed_session_ends_with_its_last_message(root: Path) -> None:
-    """The watermark does not pass the time in which the node was off, unless numbers tell what was lost in it."""
+    """The watermark does not cover the time in which the node was off, unless sequence numbers show its losses."""
     first = new_spool(root, FakeClock())
     first.open()
     hear(first, 1, 2)
@@ -519,7 +519,7 @@ def test_a_killed_session_ends_with_its_last_message(root: Path) -> None:
 
 
 def test_revisions_continue_after_the_index_is_rebuilt(root: Path) -> None:
-    """Versions begin anew then; what is told by the new index is newer than all that the old one told."""
+    """Versions restart then; statements from the new index are newer than all those from the old one."""
     spool = new_spool(root, FakeClock())
     spool.open()
     hear(spool, 1, 6, 11, 16)
@@ -538,7 +538,7 @@ def test_revisions_continue_after_the_index_is_rebuilt(root: Path) -> None:
 
 
 def test_gaps_of_a_boot_are_reported_once_its_clock_is_known(spool: Spool, root: Path) -> None:
-    """First without a date, then with one, under the same name: the newest is the dated one."""
+    """First without a date, then with one, under the same name: the newest one is dated."""
     with spool.accounts.entry(CAMERA) as account:
         account.drop('queue_full', 3, by_arrival(5 * SECOND), by_arrival(6 * SECOND))
     spool.commit()
@@ -557,7 +557,7 @@ def test_gaps_of_a_boot_are_reported_once_its_clock_is_known(spool: Spool, root:
 
 
 def test_a_missions_end_is_reported_soon(spool: Spool, root: Path) -> None:
-    """Within seconds, not within the period."""
+    """Within seconds, not at the end of the period."""
     now = [0.0]
     catalog = writer(root, monotonic=lambda: now[0])
     catalog.due()
@@ -572,7 +572,7 @@ def test_a_missions_end_is_reported_soon(spool: Spool, root: Path) -> None:
 
 
 def test_a_backlog_of_rows_is_split_with_the_watermark_last(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No watermark stands over rows that are not told yet."""
+    """No watermark covers rows that are not reported yet."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MAX_ROWS', 2)
     for number in range(1, 100, 20):
         hear(spool, number)

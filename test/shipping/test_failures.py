@@ -1,4 +1,4 @@
-"""A store that refuses credentials, a bucket or an object: each delays no more than it must."""
+"""A store that refuses credentials, a bucket or an object: each delays no more than necessary."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ TABLE = [
 
 @pytest.mark.parametrize(('kind', 'verdict'), TABLE, ids=lambda value: getattr(value, '__name__', value))
 def test_each_error_of_a_store_has_its_verdict(kind: type[errors.StoreError], verdict: Verdict) -> None:
-    """Each class of the tree leads to exactly this, and its subclasses to the same."""
+    """Each class of the tree leads to exactly this, and so do its subclasses."""
     assert decide(kind('x')) is verdict
     assert decide(type('Special', (kind,), {})('x')) is verdict
 
@@ -59,7 +59,7 @@ def test_the_table_names_every_store_error() -> None:
     (errors.AccessDenied('x', reason='AccessDenied'), 'access_denied'),
 ])  # fmt: skip
 def test_a_reason_can_name_a_folder(error: errors.StoreError, reason: str) -> None:
-    """A word from a server becomes part of a path only where it is harmless there."""
+    """Text from a server becomes part of a path only if it is safe there."""
     assert quarantine_reason(error) == reason
 
 
@@ -67,7 +67,7 @@ AWAY = StoreUnavailable('Tower is away')
 
 
 def test_rejected_credentials_pause_everything_and_are_logged_immediately(drive: Drive) -> None:
-    """No object is to blame: none is deferred, and one probe at a time finds out when it is right again."""
+    """No object is deferred, and one probe at a time finds out when the credentials are valid again."""
     drive.spool.add(4)
     for _ in range(5):
         drive.fail(drive.wait(), CredentialsRejected('wrong key'))
@@ -81,7 +81,7 @@ def test_rejected_credentials_pause_everything_and_are_logged_immediately(drive:
 
 
 def test_each_cause_of_an_outage_is_logged_once(drive: Drive) -> None:
-    """Tower comes back with other keys: that is news, its coming and going afterwards is not."""
+    """Tower returns with other keys: that is logged, but going up and down after that is not."""
     drive.spool.add(4)
     for error in (AWAY, AWAY, CredentialsRejected('wrong key'), AWAY, CredentialsRejected('wrong key')):
         drive.fail(drive.wait(), error)
@@ -89,7 +89,7 @@ def test_each_cause_of_an_outage_is_logged_once(drive: Drive) -> None:
 
 
 def test_a_missing_bucket_delays_only_its_own_objects(drive: Drive) -> None:
-    """Those of other buckets go on, though hundreds of the missing one come first."""
+    """Those of other buckets continue, though hundreds of the missing one are first."""
     drive.spool.add(300, bucket='missing', priority=0)
     drive.spool.add(100, bucket='there', priority=9)
     failures = 0
@@ -109,7 +109,7 @@ def test_a_missing_bucket_delays_only_its_own_objects(drive: Drive) -> None:
 
 
 def test_other_buckets_continue_while_a_missing_one_is_probed(drive: Drive) -> None:
-    """A probe that hangs holds up nobody outside its bucket."""
+    """A probe that hangs delays only its bucket."""
     drive.spool.add(300, bucket='missing', priority=0)
     one, two = drive.spool.add(2, bucket='there', priority=9)
     first = drive.next()
@@ -126,7 +126,7 @@ def test_other_buckets_continue_while_a_missing_one_is_probed(drive: Drive) -> N
 
 
 def test_a_recovered_bucket_is_drained_before_the_spool_counts_as_drained(drive: Drive) -> None:
-    """Its objects were left out while it was away."""
+    """Its objects were skipped while it was unreachable."""
     drive.spool.add(3)
     drive.fail(drive.wait(), BucketMissing('x'))
     drive.deliver(drive.wait())
@@ -138,7 +138,7 @@ def test_a_recovered_bucket_is_drained_before_the_spool_counts_as_drained(drive:
 
 
 def test_an_answer_about_a_bucket_shows_that_the_store_is_back(drive: Drive) -> None:
-    """Who says that a bucket is missing is not away."""
+    """A response that a bucket is missing shows that the store is reachable."""
     drive.spool.add(3)
     for _ in range(2):
         drive.fail(drive.wait(), AWAY)
@@ -148,7 +148,7 @@ def test_an_answer_about_a_bucket_shows_that_the_store_is_back(drive: Drive) -> 
 
 
 def test_an_object_denied_while_its_bucket_accepts_others_is_quarantined(drive: Drive) -> None:
-    """One denial is a question; deliveries to the bucket and further denials in turns are the answer, within some minutes."""
+    """After one denial, deliveries to the bucket and more denials alternate; the object is quarantined within minutes."""
     denied = drive.spool.add(priority=0)[0]
     drive.spool.add(1200)
     reasons = []
@@ -166,7 +166,7 @@ def test_an_object_denied_while_its_bucket_accepts_others_is_quarantined(drive: 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.sampled
 def test_denials_that_come_and_go_quarantine_nothing(clock: Time, tmp_path: Path) -> None:
-    """A store that denies everything for some seconds, again and again, gets everything all the same."""
+    """A store that denies everything for some seconds, repeatedly, gets everything in the end."""
     denied, days = 0, examples(20)
     for seed in range(days):
         rng = random.Random(seed)
@@ -188,7 +188,7 @@ def test_denials_that_come_and_go_quarantine_nothing(clock: Time, tmp_path: Path
 
 
 def test_if_all_are_denied_they_wait_for_permission(drive: Drive) -> None:
-    """The credentials lack the right: the bucket waits, said once, and other buckets go on."""
+    """The credentials lack the permission: the bucket waits, which is logged once, and other buckets continue."""
     drive.spool.add(20, bucket='closed', priority=0)
     drive.spool.add(20, bucket='open', priority=9)
     denials = 0
@@ -207,7 +207,7 @@ def test_if_all_are_denied_they_wait_for_permission(drive: Drive) -> None:
 
 
 def test_a_denied_bucket_is_probed_with_another_object(drive: Drive) -> None:
-    """One denied object alone in its bucket does not block what comes later."""
+    """A single denied object in its bucket does not block later ones."""
     denied = drive.spool.add(priority=0)[0]
     for _ in range(3):
         assert drive.wait() == denied
@@ -226,7 +226,7 @@ def test_a_denied_bucket_is_probed_with_another_object(drive: Drive) -> None:
     (ForeignObject('x'), 'foreign'),
 ])  # fmt: skip
 def test_terminally_refused_objects_are_quarantined_and_stop_nothing(drive: Drive, error: StoreError, reason: str) -> None:
-    """Also as the probe of an outage: the next probe goes at once."""
+    """Also as the probe of an outage: the next probe follows immediately."""
     drive.spool.add(4)
     assert drive.fail(drive.wait(), error) == reason
     drive.fail(drive.wait(), AWAY)
@@ -235,7 +235,7 @@ def test_terminally_refused_objects_are_quarantined_and_stop_nothing(drive: Driv
 
 
 def test_a_defect_delays_only_its_object(drive: Drive) -> None:
-    """It is deferred, the store is not blamed, and it is tried again."""
+    """It is deferred, the store stays usable, and the object is retried."""
     first, second = drive.spool.add(2)
     assert drive.next() == first
     drive.schedule.crashed(Ship(first), TypeError('oops'))

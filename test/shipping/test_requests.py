@@ -1,4 +1,4 @@
-"""Kept data is sent when it is requested, and every request is answered."""
+"""Kept data is sent on request, and every request gets a response."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
 
 
 def test_objects_on_request_stay_until_requested(desk: Desk) -> None:
-    """It is accounted for as kept, lies apart, and is sent, verified, once somebody asks; the ledger closes all along."""
+    """It is counted as kept, stored separately, and sent and verified on request; the ledger balances at every step."""
     desk.keeps(*(frame(number) for number in range(5)))
     assert desk.deliver() == 0
     found = assert_whole(desk.root)
@@ -52,7 +52,7 @@ def test_objects_on_request_stay_until_requested(desk: Desk) -> None:
 
 
 def test_a_repeated_request_counts_once(desk: Desk) -> None:
-    """The same want has the same id, whoever asks; what was answered stays answered."""
+    """The same request has the same id from any client; its response is final."""
     desk.keeps(frame(1))
     first, second = desk.ask(sensor='camera'), desk.ask(by='other', sensor='camera')
     assert first == second
@@ -71,7 +71,7 @@ def test_a_repeated_request_counts_once(desk: Desk) -> None:
     ({'keys': frozenset({'thor/camera/20251018/000005_front.jpg'})}, [5]),
 ])  # fmt: skip
 def test_a_request_selects_by_all_its_criteria(desk: Desk, want: dict[str, Any], numbers: list[int]) -> None:
-    """All that is given must hold."""
+    """All given criteria must match."""
     desk.keeps(*(frame(number, metadata={meta.MISSION_ID: 'patrol_1', meta.MISSION_TYPE: 'patrol'} if number == 7 else
                        {meta.GPS: f'0 {179.999 if number == 1 else -179.999} 0'} if number in {1, 2} else {})
                  for number in range(8)))  # fmt: skip
@@ -83,7 +83,7 @@ def test_a_request_selects_by_all_its_criteria(desk: Desk, want: dict[str, Any],
 
 
 def test_a_kill_at_any_moment_loses_no_request(desk: Desk) -> None:
-    """After each step of a pull the node dies; what was asked for arrives once, and is answered."""
+    """The node is killed after each step of a pull; the requested data arrives once, with a response."""
     desk.keeps(*(frame(number) for number in range(4)))
     request = desk.ask(sensor='camera')
     for _ in range(3):
@@ -100,7 +100,7 @@ def test_a_kill_at_any_moment_loses_no_request(desk: Desk) -> None:
 
 
 def test_eviction_starts_with_the_oldest_and_spares_requested_objects(tmp_path: Path) -> None:
-    """Beyond keep.max_bytes what nobody waits for is evicted, as the ledger says; where all is waited for, the new."""
+    """Above keep.max_bytes unrequested objects are evicted, as the ledger shows; if all are requested, the new ones."""
     size = 200 << 10
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
     with closing(desk.spool):
@@ -121,7 +121,7 @@ def test_eviction_starts_with_the_oldest_and_spares_requested_objects(tmp_path: 
 
 
 def test_keeping_ends_when_protected_objects_alone_exceed_the_limit(tmp_path: Path) -> None:
-    """Nothing protected goes: what is new is not kept, and that is counted."""
+    """Protected objects stay: new ones are not kept, and counted."""
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
     with closing(desk.spool):
         desk.keeps(*(frame(number, body=bytes([number]) * (300 << 10), protected=True) for number in range(4)))
@@ -132,7 +132,7 @@ def test_keeping_ends_when_protected_objects_alone_exceed_the_limit(tmp_path: Pa
 
 
 def test_objects_kept_for_too_long_are_evicted(desk: Desk) -> None:
-    """After keep.days, but not what somebody waits for."""
+    """After keep.days, unless requested."""
     desk.keeps(frame(1), frame(2))
     desk.clock.now_ns += 15 * 24 * 3600 * SECOND
     desk.ask(patterns=('*/000002_front.jpg',))
@@ -142,7 +142,7 @@ def test_objects_kept_for_too_long_are_evicted(desk: Desk) -> None:
 
 
 def test_requesters_share_the_link(desk: Desk) -> None:
-    """One who asks for much does not keep another one waiting; a more important request has more of the link, not all."""
+    """A client that requests a lot does not block another; a more important request gets a larger share of the link, not all."""
     size = 100 << 10
     for number in range(0, 300, 30):
         desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(number, number + 30)))
@@ -161,7 +161,7 @@ def test_requesters_share_the_link(desk: Desk) -> None:
 
 
 def test_cancel_and_expiry_end_a_request(desk: Desk) -> None:
-    """What was released goes on its way; the rest stays, and the last answer says how much that is."""
+    """Released objects are sent; the rest is kept, and the last response has its size."""
     size = 100 << 10
     for number in range(0, 200, 50):
         desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(number, number + 50)))
@@ -184,7 +184,7 @@ def test_cancel_and_expiry_end_a_request(desk: Desk) -> None:
 
 
 def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
-    """By its size, its form, its fields, its ids; what is right in it counts all the same, and nothing ends the robot."""
+    """By its size, form, fields and ids; the valid entries count, and the robot continues."""
     desk.keeps(frame(1))
     good = PullRequest(
         robot='thor',
@@ -227,7 +227,7 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
 
 
 def test_a_kill_during_acceptance_leaves_no_partial_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A request is accepted in pieces, so that nobody waits for long; before its row nothing of it counts, nor bars eviction."""
+    """A request is accepted in pieces, so that nothing is blocked for long; before its row exists nothing of it is visible."""
     monkeypatch.setattr('shadowhound_data_logger.spool.requests.PIECE', 4)
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
     desk.keeps(*(frame(number) for number in range(10)))
@@ -247,7 +247,7 @@ def test_a_kill_during_acceptance_leaves_no_partial_request(tmp_path: Path, monk
         assert desk.spool.reading.requests.rows() == []
         assert len(desk.spool.reading.requested.unreleased(request, 100)) == 8
     desk.entries.clear()
-    desk.write(encode_inbox([]))  # the requester took it out again
+    desk.write(encode_inbox([]))  # the client removed it again
     desk.open()
     with closing(desk.spool):
         desk.step()
@@ -259,7 +259,7 @@ def test_a_kill_during_acceptance_leaves_no_partial_request(tmp_path: Path, monk
 
 
 def test_a_flooding_requester_delays_no_other(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One asks for all in more ways than are looked at together; another one's few objects are among the first that are sent."""
+    """One requests everything in more variants than are read together; the few objects of another are among the first sent."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.requests.AT_A_TIME', 6)
     size = 60 << 10
     desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(80)))
@@ -271,7 +271,7 @@ def test_a_flooding_requester_delays_no_other(desk: Desk, monkeypatch: pytest.Mo
 
 
 def test_a_request_expires_in_the_middle_of_a_slice_of_many(desk: Desk) -> None:
-    """What was released arrives, the rest stays here and may be evicted and asked for again; the last answer has both."""
+    """Released objects arrive, the rest is kept and may be evicted or requested again; the last response has both."""
     size = 200 << 10
     for number in range(0, 60, 20):
         desk.keeps(*(frame(n, body=b'%06d' % n * (size // 6)) for n in range(number, number + 20)))
@@ -293,7 +293,7 @@ def test_a_request_expires_in_the_middle_of_a_slice_of_many(desk: Desk) -> None:
 
 
 def test_a_mailbox_that_keeps_changing_requests_once(desk: Desk) -> None:
-    """Whatever changes in an entry but what it asks for, and however often it is there; others are served meanwhile."""
+    """Whatever changes in an entry except its selection, and however often it is there; others are served at the same time."""
     desk.keeps(*(frame(number) for number in range(4)))
     asked = PullRequest(robot='thor', by='flood', made_ns=desk.clock.now_ns, expires_ns=desk.clock.now_ns + 3600 * SECOND,
                         want=KeptFilter(sensor='camera', until_ns=NOON_NS + 2 * SECOND))  # fmt: skip
@@ -318,7 +318,7 @@ def test_a_mailbox_that_keeps_changing_requests_once(desk: Desk) -> None:
 
 
 def test_many_requests_are_remembered_and_the_first_ones_forgotten(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where that is too many, so that those who asked for nothing, again and again, keep nobody out."""
+    """Beyond a limit, so that clients that repeatedly request nothing do not block others."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.requests.MAX_REQUESTS', 4)
     desk.keeps(frame(1))
     for number in range(10):

@@ -1,4 +1,4 @@
-"""The order of uploads, their threads under a cap and with large objects, probes during an outage, and when all is delivered."""
+"""The order of uploads, their threads under a cap and with large objects, probes during an outage, and the drained state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AWAY = StoreUnavailable('Tower is away')
 
 
 def test_important_objects_go_first_and_each_fourth_is_the_oldest(drive: Drive) -> None:
-    """Neither the backlog nor what is live starves, whatever is larger."""
+    """Neither the backlog nor live data starves, whichever is larger."""
     old = [item.id for item in drive.spool.add(100, priority=7)]
     new = [item.id for item in drive.spool.add(100, priority=2)]
     order = []
@@ -39,7 +39,7 @@ def test_important_objects_go_first_and_each_fourth_is_the_oldest(drive: Drive) 
 
 
 def test_the_spool_is_polled_for_a_bounded_number(drive: Drive) -> None:
-    """What a claim costs does not depend on the backlog: a thousand objects take some 2 x 1000 / 60 queries."""
+    """The cost of a claim does not depend on the backlog: a thousand objects take about 2 x 1000 / 60 queries."""
     drive.spool.add(1000)
     for _ in range(1000):
         item = drive.next()
@@ -50,7 +50,7 @@ def test_the_spool_is_polled_for_a_bounded_number(drive: Drive) -> None:
 
 
 def test_urgent_objects_overtake_earlier_ones(drive: Drive) -> None:
-    """A wake makes the next look happen at once."""
+    """A wake triggers the next poll immediately."""
     drive.spool.add(100, priority=7)
     assert drive.next()
     urgent = drive.spool.add(priority=0)[0]
@@ -59,7 +59,7 @@ def test_urgent_objects_overtake_earlier_ones(drive: Drive) -> None:
 
 
 def test_announced_objects_are_shipped_without_a_poll(drive: Drive) -> None:
-    """Where nothing else waits, what has just been spooled is known, and goes in its order."""
+    """If nothing else is pending, newly spooled objects are known, and are sent in order."""
     assert drive.next() is None
     looks = drive.spool.looks
     later, sooner = drive.spool.add(priority=7)[0], drive.spool.add(priority=2)[0]
@@ -73,7 +73,7 @@ def test_announced_objects_are_shipped_without_a_poll(drive: Drive) -> None:
 
 
 def test_a_backlog_is_read_from_the_spool(drive: Drive) -> None:
-    """What was told of is then a part of the backlog only."""
+    """Announced objects are then just a part of the backlog."""
     assert drive.next() is None
     looks = drive.spool.looks
     drive.schedule.wake(drive.spool.add(FEW))
@@ -82,7 +82,7 @@ def test_a_backlog_is_read_from_the_spool(drive: Drive) -> None:
 
 
 def test_an_object_is_claimed_once_until_it_is_settled(drive: Drive) -> None:
-    """Delivered is not yet durable: until the spool knows, it calls the object pending, and we do not believe it."""
+    """Delivered is not durable yet: until the commit the spool lists the object as pending, and the schedule ignores that."""
     drive.spool.add()
     item = drive.next()
     assert item is not None
@@ -108,7 +108,7 @@ def test_a_query_during_a_settlement_does_not_return_the_object_again(drive: Dri
 
 
 def test_only_one_thread_queries_the_spool_at_a_time(drive: Drive) -> None:
-    """The others ship what is there, or rest."""
+    """The others ship what was found, or wait."""
     drive.spool.add(5)
     assert isinstance(drive.schedule.step(), Look)
     drive.schedule.wake()
@@ -116,7 +116,7 @@ def test_only_one_thread_queries_the_spool_at_a_time(drive: Drive) -> None:
 
 
 def test_objects_of_another_process_are_found_without_a_wake(drive: Drive) -> None:
-    """An idle drain looks once a second."""
+    """An idle drain polls once per second."""
     assert drive.next() is None
     item = drive.spool.add()[0]
     assert drive.next() is None
@@ -125,7 +125,7 @@ def test_objects_of_another_process_are_found_without_a_wake(drive: Drive) -> No
 
 
 def test_without_the_drain_lock_nothing_is_shipped(drive: Drive) -> None:
-    """Another process drains: every step is a rest, until it is ours."""
+    """Another process drains: every step waits until it releases the lock."""
     drive.spool.add()
     drive.schedule.activate(False)
     assert drive.next() is None
@@ -135,7 +135,7 @@ def test_without_the_drain_lock_nothing_is_shipped(drive: Drive) -> None:
 
 
 def test_drained_means_that_nothing_is_pending_and_all_is_durable(drive: Drive) -> None:
-    """Not before the spool was asked, and not before every outcome is settled."""
+    """Not before the spool was queried, and not before every outcome is settled."""
     assert isinstance(drive.schedule.drained(), Rest)
     assert drive.next() is None
     assert drive.schedule.drained() is True
@@ -153,7 +153,7 @@ def test_drained_means_that_nothing_is_pending_and_all_is_durable(drive: Drive) 
 
 
 def test_waiting_for_the_drain_ends_when_the_store_is_unreachable(drive: Drive) -> None:
-    """One failure may be a hiccup, the second is an outage."""
+    """One failure may be transient, the second is an outage."""
     drive.spool.add(3)
     drive.fail(drive.wait(), AWAY)
     assert isinstance(drive.schedule.drained(), Rest)
@@ -162,7 +162,7 @@ def test_waiting_for_the_drain_ends_when_the_store_is_unreachable(drive: Drive) 
 
 
 def test_waiting_for_the_drain_ends_when_only_blocked_buckets_are_left(drive: Drive) -> None:
-    """What can be delivered is, then the answer is no."""
+    """Everything that can be delivered is, then it returns False."""
     drive.spool.add(bucket='missing', priority=0)
     other = drive.spool.add(bucket='there')[0]
     item = drive.next()
@@ -176,7 +176,7 @@ def test_waiting_for_the_drain_ends_when_only_blocked_buckets_are_left(drive: Dr
 
 
 def test_after_stop_nothing_starts_but_current_uploads_are_reported(drive: Drive) -> None:
-    """A shutdown loses no outcome of a put that ends in time."""
+    """A shutdown loses no outcome of a put that ends before the deadline."""
     drive.spool.add(2)
     item = drive.next()
     assert item is not None
@@ -187,7 +187,7 @@ def test_after_stop_nothing_starts_but_current_uploads_are_reported(drive: Drive
 
 
 class Threads:
-    """A Schedule whose threads ship without ever getting done."""
+    """A Schedule with threads whose uploads never finish."""
 
     def __init__(self, spool: FakeSpool, clock: Time, count: int) -> None:
         self.spool = spool
@@ -196,9 +196,9 @@ class Threads:
         self.schedule.activate(True)
 
     def next(self) -> SpooledObject | None:
-        """What one more thread ships; None when it rests."""
+        """What one more thread ships; None if it waits."""
         self.schedule.wake()
-        self.schedule.step()  # a look
+        self.schedule.step()  # a poll
         self.schedule.found(self.spool.pending(100), self.spool.pending(100, oldest=True))
         step = self.schedule.step()
         assert isinstance(step, Ship | Rest)
@@ -206,7 +206,7 @@ class Threads:
 
 
 def test_under_a_cap_the_last_thread_is_reserved_for_more_important_objects(spool: FakeSpool, clock: Time) -> None:
-    """Four large bodies of no importance would keep an urgent object waiting for minutes."""
+    """Four large unimportant bodies would delay an urgent object for minutes."""
     threads = Threads(spool, clock, 4)
     spool.add(10, priority=7)
     assert [threads.next() is not None for _ in range(4)] == [True, True, True, False]
@@ -215,7 +215,7 @@ def test_under_a_cap_the_last_thread_is_reserved_for_more_important_objects(spoo
 
 
 def test_equally_important_objects_do_not_take_the_last_thread(spool: FakeSpool, clock: Time) -> None:
-    """The most important one under way counts."""
+    """The most important upload in progress counts."""
     threads = Threads(spool, clock, 3)
     spool.add(priority=2)
     spool.add(10, priority=7)
@@ -226,7 +226,7 @@ def test_equally_important_objects_do_not_take_the_last_thread(spool: FakeSpool,
 
 
 def test_all_threads_ship_while_the_cap_is_not_reached(spool: FakeSpool, clock: Time) -> None:
-    """Then the round trips are what takes the time."""
+    """In that case latency takes most of the time."""
     threads = Threads(spool, clock, 4)
     threads.bytes_per_s = 1000.0
     spool.add(10, priority=7)
@@ -234,7 +234,7 @@ def test_all_threads_ship_while_the_cap_is_not_reached(spool: FakeSpool, clock: 
 
 
 def test_one_thread_alone_ships_under_a_cap(spool: FakeSpool, clock: Time) -> None:
-    """There is none to be kept."""
+    """No thread can be reserved."""
     threads = Threads(spool, clock, 1)
     spool.add(2)
     assert threads.next() is not None
@@ -256,21 +256,21 @@ def started(spool: FakeSpool, server: FakeS3, max_mbps: float) -> tuple[Uploader
 
 
 def test_a_stop_does_not_wait_for_the_cap(spool: FakeSpool, server: FakeS3) -> None:
-    """What is under way is given up, reported to nobody and still pending: it is sent again."""
+    """Current uploads are aborted without an outcome and stay pending: they are sent again."""
     items = spool.add(3, content=bytes(500_000))
     uploader, store = started(spool, server, 0.1)
     until(lambda: uploader.status().sent_bytes)
     began = time.monotonic()
     uploader.close(0.2)
     until(lambda: not any(worker.alive for worker in uploader.workers))
-    assert time.monotonic() - began < 90.0  # at this cap it would be two minutes
+    assert time.monotonic() - began < 90.0  # at this cap it would take two minutes
     assert list(spool.items) == [item.id for item in items]
     assert uploader.status().last_error == ''
     store.close()
 
 
 def test_the_cap_can_be_changed_while_it_ships(spool: FakeSpool, server: FakeS3) -> None:
-    """At once; the status says which one holds and how much was sent."""
+    """Immediately; the status shows the current cap and the bytes sent."""
     spool.add(3, content=bytes(100_000))
     uploader, store = started(spool, server, 0.05)
     until(lambda: uploader.status().sent_bytes)
@@ -280,21 +280,21 @@ def test_the_cap_can_be_changed_while_it_ships(spool: FakeSpool, server: FakeS3)
     assert uploader.drain(10.0)
     now = uploader.status()
     assert (now.max_mbps, now.delivered) == (0.0, 3)
-    assert now.sent_bytes >= 4 * 100_000  # one more: the proof that nothing is overwritten
+    assert now.sent_bytes >= 4 * 100_000  # one more: the check that nothing is overwritten
     uploader.close(5.0)
     store.close()
 
 
 @pytest.fixture
 def large(spool: FakeSpool) -> list[SpooledObject]:
-    """Slices that wait, more important than anything else."""
+    """Pending slices, more important than anything else."""
     slices = [replace(item, size=LARGE_BYTES) for item in spool.add(6, priority=0)]
     spool.items.update((item.id, item) for item in slices)
     return slices
 
 
 def test_large_objects_have_half_of_the_threads(spool: FakeSpool, clock: Time, large: list[SpooledObject]) -> None:
-    """However many wait and however important they are; the other half ships what is small."""
+    """However many are pending and however important they are; the other half ships small objects."""
     drive = Drive(spool, clock, threads=4)
     assert [drive.next(), drive.next()] == large[:2]
     assert drive.next() is None
@@ -314,12 +314,12 @@ def test_the_next_large_object_follows_the_last(spool: FakeSpool, clock: Time, l
 
 
 def test_a_single_thread_ships_large_objects_too(spool: FakeSpool, clock: Time, large: list[SpooledObject]) -> None:
-    """There is none to be kept, and nothing waits for ever."""
+    """No thread can be reserved, and nothing waits indefinitely."""
     assert Drive(spool, clock, threads=1).next() == large[0]
 
 
 def test_a_failed_large_object_keeps_to_its_share(spool: FakeSpool, clock: Time, large: list[SpooledObject]) -> None:
-    """A retry is a large object as well."""
+    """A retry counts as a large object."""
     drive = Drive(spool, clock, threads=2)
     spool.add(50, priority=9)
     first = drive.next()
@@ -332,7 +332,7 @@ def test_a_failed_large_object_keeps_to_its_share(spool: FakeSpool, clock: Time,
 
 
 def test_an_unreachable_store_gets_one_probe_at_a_time(drive: Drive) -> None:
-    """After a failure nobody goes on before the backoff, and then one thread alone."""
+    """After a failure all threads wait for the backoff, and then one probes."""
     drive.spool.add(5)
     first = drive.next()
     assert first is not None
@@ -345,7 +345,7 @@ def test_an_unreachable_store_gets_one_probe_at_a_time(drive: Drive) -> None:
 
 
 def test_the_next_probe_is_another_object(drive: Drive) -> None:
-    """If it is delivered, the store was never away, and only the first object waits."""
+    """If it is delivered, the store was reachable, and only the first object waits."""
     drive.spool.add(3)
     first = drive.next()
     assert first is not None
@@ -359,7 +359,7 @@ def test_the_next_probe_is_another_object(drive: Drive) -> None:
 
 
 def test_one_failing_object_does_not_block_others(drive: Drive) -> None:
-    """Its second failure after others' success is its own: no breaker opens any more, and it is tried ever more rarely."""
+    """It failed again after others succeeded: the breaker stays closed, and the object is retried with growing pauses."""
     bad = drive.spool.add(priority=0)[0]
     drive.spool.add(500)
     tries, opened = 0, 0
@@ -378,7 +378,7 @@ def test_one_failing_object_does_not_block_others(drive: Drive) -> None:
 
 
 def test_a_put_that_fails_while_another_succeeds_is_an_error_of_its_object(drive: Drive) -> None:
-    """A put that hung for half a minute says nothing about a store that took others in that time."""
+    """A put that hung for 30 s is no evidence about a store that accepted others in that time."""
     slow, quick = drive.spool.add(2)
     assert drive.next() == slow
     assert drive.next() == quick
@@ -388,7 +388,7 @@ def test_a_put_that_fails_while_another_succeeds_is_an_error_of_its_object(drive
 
 
 def test_an_outage_is_announced_once_and_its_end_once(drive: Drive) -> None:
-    """Its second failure begins it, with the remedy; the first success ends it, with how long it took."""
+    """It starts with the second failure, with the remedy; the first success ends it, with its duration."""
     drive.spool.add(5)
     began = drive.clock.now
     for _ in range(20):
@@ -407,7 +407,7 @@ def test_an_outage_is_announced_once_and_its_end_once(drive: Drive) -> None:
 
 
 def test_concurrent_failures_count_as_one(spool: FakeSpool, clock: Time) -> None:
-    """Four threads that lose the store at once do not make the first pause sixteen times as long."""
+    """Four threads that lose the store at the same time do not multiply the first pause by sixteen."""
     drive = Drive(spool, clock, threads=4)
     spool.add(10)
     together = [drive.next() for _ in range(4)]
@@ -421,7 +421,7 @@ def test_concurrent_failures_count_as_one(spool: FakeSpool, clock: Time) -> None
 
 
 def test_the_pause_grows_to_its_maximum(drive: Drive) -> None:
-    """It retries for ever, at least once a minute."""
+    """It retries indefinitely, at least once per minute."""
     drive.spool.add(3)
     pauses = []
     for _ in range(200):
@@ -435,7 +435,7 @@ def test_the_pause_grows_to_its_maximum(drive: Drive) -> None:
 
 @pytest.mark.long('a second of CPU or more')
 def test_a_long_outage_touches_few_objects(drive: Drive) -> None:
-    """The failures that are remembered stay few, however long it lasts."""
+    """The number of remembered failures stays small, however long it lasts."""
     drive.spool.add(1000)
     for _ in range(800):
         drive.fail(drive.wait(), AWAY)
@@ -445,7 +445,7 @@ def test_a_long_outage_touches_few_objects(drive: Drive) -> None:
 
 
 def test_a_single_object_probes_the_store(drive: Drive) -> None:
-    """One object and a store that was away: it goes as soon as the breaker lets it."""
+    """One object and an unreachable store: it is sent as soon as the breaker allows it."""
     item = drive.spool.add()[0]
     for _ in range(3):
         assert drive.wait() == item

@@ -31,7 +31,7 @@ SIZE = 1000
 
 
 def recorded(number: int) -> list[Recorded]:
-    """Of two topics in turn, in one slice."""
+    """Two topics, alternating, in one slice."""
     first = number * SLICE_S * HERTZ
     return [
         Recorded((TALK, ECHO)[at % 2].topic, (log_ns := NOON_NS + at * SECOND // HERTZ), log_ns - 5, at,
@@ -41,7 +41,7 @@ def recorded(number: int) -> list[Recorded]:
 
 
 def kept_slice(folder: Path, number: int, bag: str = BAG, **more: str) -> DataObject:
-    """A slice of ten seconds as the node spools it, of some 500 KB."""
+    """A slice of ten seconds as spooled by the node, of about 500 KB."""
     writer = SliceWriter(folder / f'{bag}_{number}.mcap', compression='none', chunk_bytes=32 << 10)
     for one in recorded(number):
         writer.write({each.topic: each for each in (TALK, ECHO)}[one.topic], one.log_ns, one.publish_ns, one.sequence, one.cdr)
@@ -75,7 +75,7 @@ def asked(desk: Desk, since_s: float, until_s: float, **more: object) -> tuple[s
 
 
 def stored(desk: Desk, bag: str, folder: Path) -> list[Recorded]:
-    """The messages of a bag in the store, which is whole."""
+    """The messages of a complete bag in the store."""
     remote = find_bag(desk.store, 'thor', bag)
     manifest = read_manifest(desk.store, remote)
     assert state_of(remote, manifest, {}) == 'complete'
@@ -89,7 +89,7 @@ def stored(desk: Desk, bag: str, folder: Path) -> list[Recorded]:
 
 
 def test_a_range_within_a_slice_arrives_as_a_separate_bag(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has the messages of that time, byte for byte, and about their bytes; the slice stays, and the ledger closes."""
+    """It has the messages of that time, byte for byte, and about their size; the slice stays, and the ledger balances."""
     request, since_ns, until_ns = asked(desk, 12, 14)
     monkeypatch.setattr('shadowhound_data_logger.shipping.slice_cuts.CUT_S', 0.0)
     desk.step()
@@ -113,7 +113,7 @@ def test_a_range_within_a_slice_arrives_as_a_separate_bag(desk: Desk, tmp_path: 
 
 
 def test_a_range_over_slices_is_cut_at_its_ends(desk: Desk, tmp_path: Path) -> None:
-    """What lies within it arrives as it is; both ends are one bag."""
+    """Slices inside it arrive unchanged; the two ends are one bag."""
     request, since_ns, until_ns = asked(desk, 8, 23)
     desk.finish()
     last = desk.answers(request)[-1]
@@ -127,7 +127,7 @@ def test_a_range_over_slices_is_cut_at_its_ends(desk: Desk, tmp_path: Path) -> N
 
 
 def test_the_same_range_is_cut_and_sent_once(desk: Desk) -> None:
-    """Whoever asks for it, and in whatever words."""
+    """For any client, and however the request is written."""
     first, *_ = asked(desk, 2, 4)
     desk.finish()
     before = len(rows(desk.root))
@@ -140,7 +140,7 @@ def test_the_same_range_is_cut_and_sent_once(desk: Desk) -> None:
 
 
 def test_a_kill_during_a_cut_leaves_one_cut(desk: Desk, tmp_path: Path) -> None:
-    """Whether it died before the spool had the cut, or before the request knew of it."""
+    """Whether it was killed before the spool had the cut, or before the request referred to it."""
     request, since_ns, until_ns = asked(desk, 12, 14)
     desk.server._cuts.work = lambda _: False  # type: ignore[method-assign] # it dies before any work is done
     desk.step()
@@ -164,7 +164,7 @@ def test_a_kill_during_a_cut_leaves_one_cut(desk: Desk, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('damage', ['torn', 'gone'])
 def test_a_slice_that_cannot_be_cut_is_sent_completely(desk: Desk, damage: str) -> None:
-    """The robot goes on, and what becomes of the slice is the uploader's to say."""
+    """The robot continues, and the uploader reports the outcome of the slice."""
     path = next((desk.root / 'kept').rglob(f'{BAG}_1.mcap'))
     if damage == 'torn':
         path.write_bytes(path.read_bytes()[:-30])
@@ -178,9 +178,9 @@ def test_a_slice_that_cannot_be_cut_is_sent_completely(desk: Desk, damage: str) 
 
 
 def test_a_cancelled_request_ends_its_cut(desk: Desk) -> None:
-    """Nothing of it is sent, and nothing stays on the disk."""
+    """None of it is sent, and nothing stays on the disk."""
     ticks = itertools.count()
-    desk.server._monotonic = desk.server._cuts._monotonic = lambda: next(ticks) * 0.03  # a chunk at each step
+    desk.server._monotonic = desk.server._cuts._monotonic = lambda: next(ticks) * 0.03  # one chunk per step
     request, *_ = asked(desk, 12, 14)
     desk.step()
     desk.step()
@@ -192,7 +192,7 @@ def test_a_cancelled_request_ends_its_cut(desk: Desk) -> None:
 
 
 def test_a_slice_without_a_date_is_sent_completely(tmp_path: Path, desk: Desk) -> None:
-    """Its messages have other times than it is asked for by."""
+    """Its messages have different times from the requested ones."""
     bag = 'patrol_20251018_130000'
     desk.spool.commit([kept_slice(tmp_path, 0, bag, clock='set_later')])
     asked(desk, 2, 4, patterns=(f'thor/rosbags/{bag}/*',))

@@ -1,4 +1,4 @@
-"""Where room for what is kept runs short its rate goes before its time, and the ledger knows of each message."""
+"""If space for kept objects runs short, their rate is reduced first, then their time span; the ledger has each message."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ IMU = Channel('/imu', 'sensor_msgs/msg/Imu', '', '', '', '')
 
 
 class Robot:
-    """A spool that keeps, and what thins it."""
+    """A spool with kept objects, and its thinning."""
 
     def __init__(self, root: Path, max_bytes: int, min_hz: float = 1.0) -> None:
         self.root = root
@@ -67,12 +67,12 @@ class Robot:
         self.told()
 
     def told(self) -> None:
-        """The store knows of all."""
-        with self.spool._connections.writing.transaction():  # what a part of the catalog does when it is spooled
+        """Mark everything as reported to the store."""
+        with self.spool._connections.writing.transaction():  # as when a part of the catalog is spooled
             self.spool._connections.writing._db.execute('DELETE FROM unreported')
 
     def thin(self) -> int:
-        """Until there is room, or nothing to thin; how many steps that took."""
+        """Thin until there is room, or nothing is left to thin; returns the number of steps."""
         count = 0
         while self.thinner.step():
             count += 1
@@ -108,7 +108,7 @@ def frame(robot: Robot, number: int, hz: float = 10.0) -> DataObject:
 def archive(
     robot: Robot, number: int, *, count: int = 30, pack: Callable[..., bytes] = pack_tar, repeats: bool = False
 ) -> DataObject:
-    """A second of a camera; with ``repeats`` each third picture is the one before it again."""
+    """A second of a camera; with ``repeats`` each third image repeats the one before it."""
     members, first_ns, file = [], NOON_NS + number * SECOND, ''
     stamps = [first_ns + place * SECOND // count for place in range(count)]
     for place, stamp_ns in enumerate(stamps):
@@ -125,7 +125,7 @@ def archive(
 
 
 def bag_slice(robot: Robot, folder: Path, number: int) -> DataObject:
-    """Five seconds: 30 pictures a second and 100 of the IMU."""
+    """Five seconds: 30 images per second and 100 IMU messages."""
     folder.mkdir(exist_ok=True)
     writer = SliceWriter(folder / f'patrol_{number}.mcap')
     begin_ns = NOON_NS + 5 * number * SECOND
@@ -148,7 +148,7 @@ def bag_slice(robot: Robot, folder: Path, number: int) -> DataObject:
 
 
 def messages_of(body: bytes, content_type: str) -> dict[int, bytes]:
-    """What an archive says by its times, repeats as what they repeat."""
+    """The contents of an archive by time, repeats as the image they repeat."""
     if content_type == 'application/zip':
         with zipfile.ZipFile(BytesIO(body)) as packed:
             files = {name: packed.read(name) for name in packed.namelist()}
@@ -164,12 +164,12 @@ def messages_of(body: bytes, content_type: str) -> dict[int, bytes]:
     (30, 1.0, 15.0, True), (30, 1.0, 16.0, False), (5, 0.0, 1000.0, True),
 ])  # fmt: skip
 def test_thinning_respects_the_minimum_rate(count: int, seconds: float, min_hz: float, expected: bool) -> None:
-    """The half that stays comes as often as is asked for, or more often."""
+    """The remaining half is at least at the minimum rate."""
     assert may_halve(count, seconds * SECOND, min_hz) is expected
 
 
 def test_frames_are_thinned_before_the_oldest_are_evicted(make_robot: Callable[..., Robot]) -> None:
-    """Each second of the hour has its picture; what went is told as thinned, at its time, and the ledger closes."""
+    """Each second of the hour keeps an image; removed ones are reported as thinned, with their time, and the ledger balances."""
     robot = make_robot(1 << 20)
     for number in range(0, 1000, 50):
         robot.keep(*(frame(robot, each) for each in range(number, number + 50)))
@@ -190,7 +190,7 @@ def test_frames_are_thinned_before_the_oldest_are_evicted(make_robot: Callable[.
 @pytest.mark.parametrize('pack', [pack_tar, pytest.param(pack_zip, marks=pytest.mark.long('as for tar'))])
 @pytest.mark.parametrize('repeats', [True, pytest.param(False, marks=pytest.mark.long('without repeats'))])
 def test_an_archive_loses_every_second_image(make_robot: Callable[..., Robot], pack: Callable[..., bytes], repeats: bool) -> None:
-    """What is left is byte for byte what it was, repeats included; rows, files, descriptions and the ledger agree."""
+    """The remaining ones are byte-identical, repeats included; rows, files, descriptions and the ledger agree."""
     robot = make_robot(500 * KIB)
     items = [archive(robot, number, pack=pack, repeats=repeats) for number in range(40)]
     whole = {item.key: messages_of(bytes(item.body), item.content_type) for item in items if isinstance(item.body, bytes)}
@@ -221,7 +221,7 @@ def test_an_archive_loses_every_second_image(make_robot: Callable[..., Robot], p
 
 
 def test_a_slice_loses_only_images(make_robot: Callable[..., Robot], tmp_path: Path) -> None:
-    """The small messages stay, all of them; the loss is told by topic."""
+    """All small messages stay; the loss is reported by topic."""
     robot = make_robot(1 << 20)
     for number in range(8):
         robot.keep(bag_slice(robot, tmp_path / 'bag', number), topics=('bag:/camera', 'bag:/imu'))
@@ -249,7 +249,7 @@ def test_a_slice_loses_only_images(make_robot: Callable[..., Robot], tmp_path: P
 
 
 def test_requested_and_protected_objects_are_not_thinned(make_robot: Callable[..., Robot]) -> None:
-    """Thinning takes what nobody waits for, and leaves the rest whole."""
+    """Thinning only changes objects that are not requested."""
     robot = make_robot(1 << 20)
     robot.keep(archive(robot, 0), archive(robot, 1), archive(robot, 2))
     with robot.spool._connections.writing.transaction():
@@ -265,7 +265,7 @@ def test_requested_and_protected_objects_are_not_thinned(make_robot: Callable[..
 
 @pytest.mark.long('a second of CPU or more')
 def test_an_hour_of_thinning_is_one_gap_row(make_robot: Callable[..., Robot], caplog: pytest.LogCaptureFixture) -> None:
-    """Where room is always short, what is new is thinned every few seconds, and the log does not say so each time."""
+    """If space is always short, new objects are thinned every few seconds, without a log message each time."""
     caplog.set_level('INFO', 'shadowhound_data_logger')
     robot = make_robot(1 << 18)
     for hour in range(2):
@@ -279,7 +279,7 @@ def test_an_hour_of_thinning_is_one_gap_row(make_robot: Callable[..., Robot], ca
 
 @pytest.mark.long('thousands of pictures')
 def test_at_the_minimum_rate_the_oldest_is_evicted(make_robot: Callable[..., Robot]) -> None:
-    """Rate goes first, and then time, from its beginning."""
+    """The rate is reduced first, then the time span, from its beginning."""
     robot = make_robot(1 << 20)
     for number in range(0, 4000, 40):
         robot.keep(*(frame(robot, each) for each in range(number, number + 40)))
@@ -290,12 +290,12 @@ def test_at_the_minimum_rate_the_oldest_is_evicted(make_robot: Callable[..., Rob
 
 
 def test_each_thinning_step_is_cataloged(make_robot: Callable[..., Robot]) -> None:
-    """Also of an object that a part told of alone: it is told of again, with what is left of it."""
+    """Also an object already reported by a part: it is reported again, with its remaining messages."""
     robot, now_s = make_robot(1 << 20), [0.0]
     catalog = CatalogWriter(robot.root, CatalogSettings(), 'thor', robot.clock, lambda: now_s[0], keeps=True)
 
     def told() -> list[int]:
-        """The messages of each row of a part that is spooled now."""
+        """The messages in each row of the part that is spooled now."""
         now_s[0] += 3600.0
         made = catalog.due()
         robot.spool.commit(made)
@@ -322,7 +322,7 @@ def test_each_thinning_step_is_cataloged(make_robot: Callable[..., Robot]) -> No
 
 
 def test_thinning_is_off_at_0(make_robot: Callable[..., Robot]) -> None:
-    """The oldest goes as a whole."""
+    """The oldest is evicted completely."""
     robot = make_robot(1 << 20, 0.0)
     for number in range(40):
         robot.keep(archive(robot, number, count=60))
@@ -332,7 +332,7 @@ def test_thinning_is_off_at_0(make_robot: Callable[..., Robot]) -> None:
 
 @pytest.mark.long('a death after each step')
 def test_a_kill_at_any_moment_of_thinning_loses_nothing(root: Path, moments: Moments) -> None:
-    """An object is as it was, or thinned and its loss told once; nothing else lies there after the next start."""
+    """An object is unchanged, or thinned with its loss reported once; after the next start there are no other files."""
     robot = Robot(root, 1 << 20)
     robot.keep(archive(robot, 0), archive(robot, 1))
     robot.spool.close()

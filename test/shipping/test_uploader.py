@@ -46,7 +46,7 @@ Start = Callable[..., Uploader]
 
 
 class Recording(MemoryStore):
-    """Counts the puts of each key that succeeded."""
+    """Counts the successful puts of each key."""
 
     def __init__(self, fail: Callable[[SpooledObject | None], Exception | None] | None = None) -> None:
         super().__init__(fail)
@@ -59,7 +59,7 @@ class Recording(MemoryStore):
 
 
 class Hanging(MemoryStore):
-    """A put does not return before it is let go."""
+    """A put does not return until the test releases it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class Hanging(MemoryStore):
 
 @pytest.fixture
 def start(spool: FakeSpool) -> Iterator[Start]:
-    """Opens an uploader over the fake spool, and closes it."""
+    """Opens an uploader for the fake spool, and closes it."""
     opened: list[Uploader] = []
 
     def start(store: ObjectStore, settings: UploadSettings = SETTINGS) -> Uploader:
@@ -94,7 +94,7 @@ def lines(caplog: pytest.LogCaptureFixture, level: int) -> list[str]:
 
 
 def test_drain_delivers_everything_once(spool: FakeSpool, start: Start) -> None:
-    """Before and after open, with a wake for what came later."""
+    """Before and after open, with a wake for later objects."""
     items = spool.add(150)
     store = Recording()
     uploader = start(store)
@@ -111,7 +111,7 @@ def test_drain_delivers_everything_once(spool: FakeSpool, start: Start) -> None:
 def test_after_an_outage_everything_is_delivered_once(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """It recovers by itself; two lines tell of it, however many objects wait."""
+    """It recovers on its own; two lines are logged, however many objects are pending."""
     caplog.set_level(logging.INFO)
     items = spool.add(100)
     store = Recording(lambda _: StoreUnavailable('Tower is away', remedy='switch it on'))
@@ -129,7 +129,7 @@ def test_after_an_outage_everything_is_delivered_once(
 
 
 def test_one_failing_object_stops_no_other_upload(spool: FakeSpool, start: Start) -> None:
-    """The rest is delivered, it stays, and it goes when it can."""
+    """The rest is delivered, it stays pending, and is sent when possible."""
     bad, *rest = spool.add(60)
     store = Recording(lambda item: StoreUnavailable('broken') if item and item.id == bad.id else None)
     uploader = start(store)
@@ -142,7 +142,7 @@ def test_one_failing_object_stops_no_other_upload(spool: FakeSpool, start: Start
 def test_rejected_credentials_pause_with_one_log_line_and_resume(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """The error names the remedy; nothing is quarantined."""
+    """The error includes the remedy; nothing is quarantined."""
     caplog.set_level(logging.INFO)
     spool.add(30)
     store = Recording(lambda _: CredentialsRejected('Tower refuses the key', remedy='check AWS_SECRET_ACCESS_KEY'))
@@ -159,7 +159,7 @@ def test_rejected_credentials_pause_with_one_log_line_and_resume(
 
 @pytest.mark.parametrize('kind', [BucketMissing, AccessDenied])
 def test_a_blocked_bucket_delays_no_other(spool: FakeSpool, start: Start, kind: type[StoreError]) -> None:
-    """The others are delivered, the status names it, and it recovers."""
+    """The others are delivered, the status names the bucket, and it recovers."""
     spool.add(100, bucket='closed', priority=0)
     spool.add(100, bucket='open')
     store = Recording(lambda item: kind('not this bucket') if item and item.bucket == 'closed' else None)
@@ -178,7 +178,7 @@ def test_a_blocked_bucket_delays_no_other(spool: FakeSpool, start: Start, kind: 
 def test_terminal_failures_are_quarantined_with_their_reason_and_little_logging(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """A foreign writer is an error in the log; the second to ninth of a kind are not."""
+    """A foreign writer is logged as an error; the second to ninth of the same kind are not."""
     items = spool.add(12)
     foreign = {item.id for item in items[:8]}
     refused = items[8].id
@@ -200,7 +200,7 @@ def test_terminal_failures_are_quarantined_with_their_reason_and_little_logging(
 def test_an_object_evicted_during_upload_is_not_an_error(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """Its file is gone: its outcome says so, the log has no error."""
+    """Its file is gone: its outcome records that, and the log has no error."""
     item = spool.add()[0]
     item.path.unlink()
     uploader = start(MemoryStore())
@@ -210,7 +210,7 @@ def test_an_object_evicted_during_upload_is_not_an_error(
 
 
 def test_a_defect_is_counted_shown_and_survived(spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture) -> None:
-    """A traceback once; the thread goes on, the object is tried again, the others are delivered."""
+    """A traceback once; the thread continues, the object is retried, the others are delivered."""
     bad, *_ = spool.add(20)
     defects = [ZeroDivisionError('a defect')] * 3
     store = MemoryStore(lambda item: defects.pop() if item and item.id == bad.id and defects else None)
@@ -223,7 +223,7 @@ def test_a_defect_is_counted_shown_and_survived(spool: FakeSpool, start: Start, 
 
 
 def test_a_spool_that_cannot_be_read_is_tried_again(spool: FakeSpool, start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A failing query ends no thread."""
+    """A failing query stops no thread."""
     spool.add(5)
     failures = [OSError('disk I/O error')] * 2
     pending = spool.pending
@@ -240,7 +240,7 @@ def test_a_spool_that_cannot_be_read_is_tried_again(spool: FakeSpool, start: Sta
 
 
 def test_while_another_process_drains_nothing_is_sent_and_then_it_takes_over(spool: FakeSpool, start: Start) -> None:
-    """It asks once a second; a drain does not wait for it."""
+    """It tries once per second; a drain does not wait for it."""
     spool.lock_is_free = False
     spool.add(3)
     uploader = start(MemoryStore())
@@ -252,7 +252,7 @@ def test_while_another_process_drains_nothing_is_sent_and_then_it_takes_over(spo
 
 
 def test_close_waits_for_what_is_in_flight_and_begins_nothing(spool: FakeSpool, start: Start) -> None:
-    """Puts that end in time are settled."""
+    """Puts that end before the deadline are settled."""
     spool.add(20)
     store = Hanging()
     uploader = start(store)
@@ -269,7 +269,7 @@ def test_close_waits_for_what_is_in_flight_and_begins_nothing(spool: FakeSpool, 
 def test_close_does_not_wait_longer_than_its_deadline_for_a_put_that_hangs(
     spool: FakeSpool, start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """What hangs is reported to nobody when it comes back after all."""
+    """The result of the hung put is ignored when it returns later."""
     spool.add(20)
     store = Hanging()
     uploader = start(store)
@@ -285,7 +285,7 @@ def test_close_does_not_wait_longer_than_its_deadline_for_a_put_that_hangs(
 
 
 def test_drain_gives_up_at_its_deadline(spool: FakeSpool, start: Start) -> None:
-    """A put that hangs is not an outage yet."""
+    """A hung put is not an outage yet."""
     spool.add()
     store = Hanging()
     uploader = start(store)
@@ -296,7 +296,7 @@ def test_drain_gives_up_at_its_deadline(spool: FakeSpool, start: Start) -> None:
 
 
 def test_close_before_open_and_twice_is_fine(spool: FakeSpool) -> None:
-    """Idempotent, and nothing to wait for."""
+    """It is idempotent, and there is nothing to wait for."""
     uploader = Uploader(spool, MemoryStore(), SETTINGS, spool.settle)
     uploader.close(1.0)
     uploader.close(1.0)
@@ -304,7 +304,7 @@ def test_close_before_open_and_twice_is_fine(spool: FakeSpool) -> None:
 
 
 def test_objects_are_delivered_into_a_folder(spool: FakeSpool, start: Start, tmp_path: Path) -> None:
-    """With the store that is the default: every object is there with its content."""
+    """With the default store: every object is there with its content."""
     items = spool.add(40, content=b'\xff\xd8 a picture')
     store = open_store(StoreSettings(directory=tmp_path / 'store'), SETTINGS)
     uploader = start(store)
@@ -321,7 +321,7 @@ def data_object(number: int, bucket: str = 'sensor-data', priority: int = 5, siz
 
 
 class Draining:
-    """A real spool with an uploader whose outcomes are committed one by one."""
+    """A real spool with an uploader that commits each outcome separately."""
 
     def __init__(self, root: Path, store: MemoryStore) -> None:
         self.spool = Spool(root, SpoolSettings(min_free_bytes=0), SystemClock('boot'), 'thor')
@@ -354,7 +354,7 @@ def files(root: Path, folder: str) -> list[str]:
 
 
 def test_delivered_objects_are_removed_from_the_spool(draining: Draining, store: MemoryStore) -> None:
-    """Through an outage in the middle: every object is in the store once, no file is left."""
+    """With an outage in the middle: every object is in the store once, no file is left."""
     draining.uploader.open()
     draining.spool.commit([data_object(number) for number in range(60)])
     draining.uploader.wake()
@@ -372,7 +372,7 @@ def test_delivered_objects_are_removed_from_the_spool(draining: Draining, store:
 
 
 def test_rejected_objects_are_quarantined(draining: Draining, store: MemoryStore) -> None:
-    """Under its reason; the rest is delivered."""
+    """Under their reason; the rest is delivered."""
 
     def fail(item: SpooledObject | None) -> Exception | None:
         return ObjectRefused('no', reason='KeyTooLongError') if item and item.key.endswith('000003_odom.json') else None
@@ -386,7 +386,7 @@ def test_rejected_objects_are_quarantined(draining: Draining, store: MemoryStore
 
 
 def test_buckets_that_are_denied_keep_their_objects(draining: Draining, store: MemoryStore) -> None:
-    """Nothing of them is quarantined, whatever the number of tries; the others go."""
+    """None of them are quarantined, however many tries; the others are sent."""
     store.fail = lambda item: AccessDenied('no') if item and item.bucket == 'trajectories' else None
     draining.spool.commit([data_object(number, 'trajectories', 0) for number in range(80)])
     draining.spool.commit([data_object(number) for number in range(80)])
@@ -400,7 +400,7 @@ def test_buckets_that_are_denied_keep_their_objects(draining: Draining, store: M
 
 
 def test_two_uploaders_of_one_spool_take_turns(draining: Draining, store: MemoryStore, tmp_path: Path) -> None:
-    """One drains; when it closes, the other one takes over within some seconds, and nothing is sent twice."""
+    """One drains; when it closes, the other takes over within a few seconds, and nothing is sent twice."""
     draining.uploader.open()
     until(lambda: draining.uploader.status().state == 'idle')
     second = Draining(tmp_path / 'spool', store)
@@ -420,7 +420,7 @@ def test_two_uploaders_of_one_spool_take_turns(draining: Draining, store: Memory
 
 @pytest.mark.long('a second of CPU or more')
 def test_a_spool_that_is_full_evicts_while_objects_wait(tmp_path: Path, store: MemoryStore) -> None:
-    """What was evicted is not sent any more and not quarantined; what is left is delivered."""
+    """Evicted objects are not sent or quarantined; the remaining ones are delivered."""
     spool = Spool(tmp_path / 'spool', SpoolSettings(max_bytes=1 << 20, min_free_bytes=0), SystemClock('boot'), 'thor')
     spool.open()
     uploader: Uploader
@@ -454,7 +454,7 @@ def test_a_spool_that_is_full_evicts_while_objects_wait(tmp_path: Path, store: M
 
 __all__ = ['draining', 'store']
 MANY = 300
-"""More than is looked up at a time, and more important than what may go."""
+"""More objects than one query returns, and more important than those that may be sent."""
 
 
 def plain(first: int, count: int) -> list[DataObject]:
@@ -480,7 +480,7 @@ def spool(draining: Draining, items: Sequence[DataObject]) -> set[str]:
 
 
 def test_only_objects_under_the_rule_wait(draining: Draining, store: MemoryStore) -> None:
-    """Events and what tells of objects pass a backlog of more important ones; once the rule holds, all of it goes."""
+    """Events and records about objects overtake a backlog of more important ones; once the rule holds, everything is sent."""
     draining.uploader.wait_for({UPLOAD_WHEN: 'wifi.ssid == "lab": it is "cafe"'})
     waiting = spool(draining, plain(0, MANY))
     free = spool(draining, [event(1000), serve_policy_topics(1001)])
@@ -511,7 +511,7 @@ def test_events_may_wait_for_a_rule_of_their_own(draining: Draining, store: Memo
 
 
 def test_objects_already_read_stop_when_the_rule_no_longer_holds(draining: Draining, store: MemoryStore) -> None:
-    """And what failed before waits with it; nothing of that is asked for again and again meanwhile."""
+    """Earlier failures wait as well; none of them is queried repeatedly during that time."""
     store.fail = lambda _: StoreUnavailable('away')
     draining.uploader.open()
     waiting = spool(draining, plain(0, 20))
@@ -535,7 +535,7 @@ def test_the_spool_is_drained_when_only_objects_under_the_rule_wait(draining: Dr
 
 
 def test_an_object_that_is_protected_later_waits_for_the_same_rule(tmp_path: Path) -> None:
-    """The column that ``protect`` changes has the value that ``waits_for`` gives an object that was protected from the start."""
+    """The column changed by ``protect`` has the value that ``waits_for`` returns for an object protected from the start."""
     sensors = ('odom', '_catalog', '_', 'camera_previews', '_previews', 'previews', 'x_previewsx')
     facts: tuple[dict[str, str], ...] = ({}, {meta.EVENT: 'fall'}, {meta.EVENT: ''})
     index = Index(tmp_path / 'index.db')
@@ -553,7 +553,7 @@ def test_an_object_that_is_protected_later_waits_for_the_same_rule(tmp_path: Pat
 
 @pytest.mark.parametrize('oldest', [False, True])
 def test_waiting_objects_do_not_slow_down_queries(tmp_path: Path, oldest: bool) -> None:
-    """The few that may go are found by an index of their own."""
+    """The few that may be sent are found with a separate index."""
     opened = Draining(tmp_path / 'spool', MemoryStore())
     try:
         opened.spool.commit([*plain(0, 50), serve_policy_topics(100), event(101)])
@@ -567,7 +567,7 @@ def test_waiting_objects_do_not_slow_down_queries(tmp_path: Path, oldest: bool) 
 
 
 class Ordered(MemoryStore):
-    """Remembers in which order objects came."""
+    """Records the order in which objects arrive."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -604,7 +604,7 @@ def drained(real_spool: Spool) -> list[tuple[int, int]]:
 
 
 def test_the_most_important_are_sent_first_and_each_fourth_is_the_oldest(real_spool: Spool) -> None:
-    """Over more objects than one look finds, in the order that the index has."""
+    """For more objects than one query finds, in the order of the index."""
     real_spool.commit([data_object(number, priority=8) for number in range(100)])
     real_spool.commit([data_object(number, priority=number % 3) for number in range(100, 400)])
     came = drained(real_spool)
@@ -615,14 +615,14 @@ def test_the_most_important_are_sent_first_and_each_fourth_is_the_oldest(real_sp
 
 
 def test_a_changed_priority_applies_to_new_objects(real_spool: Spool) -> None:
-    """What lies in the spool keeps the one it was spooled with."""
+    """Objects in the spool keep the priority with which they were spooled."""
     real_spool.commit([data_object(1, priority=7), data_object(2, priority=5)])
     real_spool.commit([data_object(3, priority=1)])
     assert [priority for priority, _ in drained(real_spool)] == [1, 5, 7]
 
 
 class Deadly(MemoryStore):
-    """Puts of one object raise what is in ``deaths``."""
+    """Puts of one object raise the exceptions in ``deaths``."""
 
     def __init__(self, victim: int = 0) -> None:
         super().__init__()
@@ -636,7 +636,7 @@ class Deadly(MemoryStore):
 
 
 def test_a_thread_that_fails_in_a_put_loses_nothing(spool: FakeSpool, start: Callable[[MemoryStore], Uploader]) -> None:
-    """What it held stays pending and is sent again, by the same thread or another; each death is counted."""
+    """Its object stays pending and is sent again, by the same thread or another; each crash is counted."""
     victim, *rest = spool.add(20)
     uploader = start(Deadly(victim.id))
     until(lambda: not spool.items)
@@ -646,7 +646,7 @@ def test_a_thread_that_fails_in_a_put_loses_nothing(spool: FakeSpool, start: Cal
 
 def test_a_drain_lock_that_cannot_be_opened_is_tried_again(spool: FakeSpool, start: Callable[[MemoryStore], Uploader],
                                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """Nothing is sent meanwhile, and it is asked for again."""
+    """Nothing is sent during that time, and opening it is retried."""
     spool.add(3)
     failures, lock = [SystemExit(1), OSError('no locks available')], spool.drain_lock
 
@@ -666,18 +666,18 @@ DAYS = 10
 
 
 def check_days(summary: Summary, first: int, days: int) -> None:
-    """Every day went well; else the seeds and the figures are shown."""
+    """Every day succeeded; otherwise the seeds and the values are shown."""
     assert summary.days == days, '\n'.join((f'seeds {first} to {first + days - 1}', *summary.lines()))
 
 
 def test_random_faults_of_simulated_days_lose_nothing() -> None:
-    """With the clock, the pauses and the network simulated, and all else real."""
+    """With a simulated clock, pauses and network, and everything else real."""
     first = given_seed()
     check_days(simulated(range(first, first + DAYS)), first, DAYS)
 
 
 def test_a_simulated_day_is_the_same_each_time(tmp_path: Path) -> None:
-    """To the last request, so that a seed is a bug report."""
+    """Down to the last request, so that a seed is a bug report."""
     first, second = (Day(7, tmp_path / name).run() for name in ('first', 'second'))
     assert first == second
     assert first.requests

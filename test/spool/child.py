@@ -1,4 +1,4 @@
-"""Another process that uses a spool, run as ``python -m spool.child VERB ROOT ...``; it says on standard output what it did."""
+"""Another process that uses a spool, run as ``python -m spool.child VERB ROOT ...``; prints its results to standard output."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TEST = Path(__file__).parents[1]
 
 @contextmanager
 def started(verb: str, root: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """A running child; killed at the end if it has not ended."""
+    """A running child; killed at the end if it is still running."""
     path = os.pathsep.join((str(TEST), str(TEST.parent), os.environ.get('PYTHONPATH', '')))
     command = [sys.executable, '-m', 'spool.child', verb, str(root), *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, 'PYTHONPATH': path}) as process:
@@ -39,12 +39,12 @@ def started(verb: str, root: Path, *arguments: object) -> Iterator[subprocess.Po
 
 
 def say(**said: Any) -> None:
-    """One JSON line to the parent; a single write, so that a kill cuts no line of what is told."""
+    """Send one JSON line to the parent; a single write, so that a kill never truncates a line."""
     os.write(1, (json.dumps(said) + '\n').encode())
 
 
 def hold(root: Path) -> None:
-    """Take the drain lock and wait for the end."""
+    """Take the drain lock and keep it until killed."""
     spool = new_spool(root)
     spool.open()
     with spool.drain_lock() as mine:
@@ -53,7 +53,7 @@ def hold(root: Path) -> None:
 
 
 def add(root: Path, name: str, number: str) -> None:
-    """Commit objects that want keys which others want, too."""
+    """Commit objects with keys that other processes request, too."""
     spool = new_spool(root)
     spool.open()
     say(opened=True)
@@ -63,7 +63,7 @@ def add(root: Path, name: str, number: str) -> None:
 
 
 def load(root: Path) -> None:
-    """Receive, commit and settle without end, and tell of everything that is durable."""
+    """Receive, commit and settle in an endless loop, and report everything that is durable."""
     spool = new_spool(root)
     spool.open()
     for number in count():
@@ -73,7 +73,7 @@ def load(root: Path) -> None:
         with spool.accounts.entry('/unnumbered') as account:
             for _ in range(30):
                 account.receive(None, None)
-            stamps = [(40 * number + place) * PERIOD_NS for place in range(30)]  # in each turn ten are lost
+            stamps = [(40 * number + place) * PERIOD_NS for place in range(30)]  # every turn loses ten
             account.observe({'': stamps}, ArrivalContext(gid='p'))
             account.skipped += 30
         items = spool.commit([make(f'thor/{os.getpid()}/{number % 7}/{index}.jpg', os.urandom(2000)) for index in range(2)])
@@ -86,7 +86,7 @@ def load(root: Path) -> None:
 
 
 def die(root: Path, moment: str) -> None:
-    """End without warning in a commit: before it is one, or before its files have their names."""
+    """Exit without warning during a commit: before the transaction is durable, or before its files have their final names."""
     spool = new_spool(root)
     spool.open()
     put(spool, make('thor/whole.jpg', b'whole'))
@@ -98,7 +98,7 @@ def die(root: Path, moment: str) -> None:
 
 
 def bind(root: Path, moment: str) -> None:
-    """End without warning while two held objects get their final names."""
+    """Exit without warning while two held objects get their final names."""
     spool = new_spool(root)
     spool.open()
     put(spool, *(make(f'thor/provisional/{name}', name.encode(), held='clock') for name in 'ab'))

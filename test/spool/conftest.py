@@ -1,4 +1,4 @@
-"""A spool in a separate folder, with a clock that the test owns."""
+"""A spool in a separate folder, with a clock controlled by the test."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ CALLS = frozenset({
     'open', 'write', 'flush', 'fsync', 'link', 'replace', 'unlink', 'mkdir', 'rmdir', 'setxattr', 'flock', 'close', 'execute',
     'executemany', 'executescript',
 })  # fmt: skip
-"""Built-in functions that change a spool, or stand between two that do."""
+"""Built-in functions that change a spool, or run between two that do."""
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Where the spool is."""
+    """The spool's folder."""
     return tmp_path / 'spool'
 
 
 @pytest.fixture
 def clock() -> FakeClock:
-    """A clock that stands still until it is moved."""
+    """A clock that stops until the test moves it."""
     return FakeClock()
 
 
 @pytest.fixture
 def opened(root: Path, clock: FakeClock) -> Iterator[Open]:
-    """Opens spools on ``root`` (several: those of other processes) and closes what is left open."""
+    """Opens spools on ``root`` (several act as separate processes) and closes those left open."""
     spools: list[Spool] = []
 
     def open_one(robot: str = 'thor', **settings: float) -> Spool:
@@ -54,7 +54,7 @@ def opened(root: Path, clock: FakeClock) -> Iterator[Open]:
 
 @pytest.fixture
 def spool(opened: Open) -> Spool:
-    """An open spool, empty."""
+    """An open, empty spool."""
     return opened()
 
 
@@ -72,10 +72,10 @@ def used(opened: Open, root: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def moments(root: Path, tmp_path: Path) -> Moments:
-    """Copies of the spool as a kill at each moment of a work would leave it: before each call to the system that changes it.
+    """Copies of the spool as a kill at each step of an operation would leave it: one before each system call that changes it.
 
-    What the kernel has been told survives a killed process, and nothing else; so the copies are made while it works. The last
-    one is that of a process that lived to the end.
+    Whatever the kernel has received survives a killed process, and nothing else; so the copies are made during the operation.
+    The last copy is that of a process that finished.
     """
 
     def copies(work: Callable[[], None]) -> list[Path]:

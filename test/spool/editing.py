@@ -1,4 +1,4 @@
-"""Damages the index of a spool where SQLite sees nothing wrong: cells, rows and tables; used by ``python -m torture.fuzz``."""
+"""Damages the index of a spool in ways that SQLite accepts: cells, rows and tables; used by ``python -m torture.fuzz``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VALUES: Final = (None, 0, 1, -1, 7, 2**31, 2**63 - 1, -(2**63), 1.5, '', 'x', 'p
 
 
 def edit(base: Path, root: Path, rng: random.Random) -> list[str]:
-    """Copy the spool and change one to four things in its index; what was done, in words."""
+    """Copy the spool and make one to four changes to its index; returns a description of them."""
     shutil.copytree(base, root)
     done: list[str] = []
     db = sqlite3.connect(root / 'index.db')
@@ -34,7 +34,7 @@ def edit(base: Path, root: Path, rng: random.Random) -> list[str]:
 
 
 def _change(db: sqlite3.Connection, table: str, rng: random.Random) -> list[str]:
-    """One cell, one row, or all of them; nothing where a constraint forbids it."""
+    """Change one cell, one row, or all rows; does nothing if a constraint forbids it."""
     columns = [row[1] for row in db.execute(f'PRAGMA table_info({table})')]
     rows = [row[0] for row in db.execute(f'SELECT {columns[0]} FROM {table}')]  # noqa: S608 - own names only
     kind = rng.random()
@@ -56,14 +56,14 @@ def _change(db: sqlite3.Connection, table: str, rng: random.Random) -> list[str]
 
 
 def check(root: Path, bodies: Mapping[str, bytes]) -> dict[str, int]:
-    """A start works, nothing is shipped that was not spooled so, the sums of the ledger close or it is told; what was done."""
+    """The spool opens, ships only what was spooled, and its ledger balances or reports that it does not; returns what it did."""
     spool = used(root)
     done = dict(+spool.recovery.counts)
     sent = ship(spool)
     whole = set(bodies.values())
     assert set(sent.values()) <= whole, 'something was shipped that was never spooled'
     told = any('ledger' in what or 'index' in what for what in done)
-    assert told or ledger.imbalances(ledger.read(root, 'thor')) == [], 'the sums of the ledger do not close, and nothing says so'
+    assert told or ledger.imbalances(ledger.read(root, 'thor')) == [], 'the ledger does not balance, and no finding reports it'
     spool.close()
     again = new_spool(root)
     again.open()

@@ -1,4 +1,4 @@
-"""Objects for the spool, and what must be true of any spool at any time."""
+"""Objects for the spool, and invariants that every spool must satisfy at any time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ IN_SPOOL = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quar
 
 @dataclass(slots=True)
 class FakeClock:
-    """Time that passes when told to."""
+    """A clock that advances only when the test says so."""
 
     now_ns: int = NOON_NS
     boot_id: str = 'a-boot'
@@ -41,7 +41,7 @@ class FakeClock:
 
 
 def new_spool(root: Path, clock: FakeClock | None = None, robot: str = 'thor', **settings: float) -> Spool:
-    """A spool that is not open yet, without a lower limit on free space."""
+    """A spool that is not open yet, without a minimum of free space."""
     return Spool(root, SpoolSettings(**{'min_free_bytes': 0, **settings}), clock or FakeClock(), robot)
 
 
@@ -55,7 +55,7 @@ def make(key: str = KEY, body: bytes = b'content', **fields: Any) -> DataObject:
 
 
 def receive(spool: Spool, count: int = 1, topic: str = '/camera', publisher: str = 'p') -> None:
-    """Account for as many messages taken, with the numbers that follow."""
+    """Account for this many received messages, with the next sequence numbers."""
     with spool.accounts.entry(topic) as account:
         span = account.publishers.get(publisher)
         first = (span.last or 0) + 1 if span else 1
@@ -78,14 +78,14 @@ def settle(spool: Spool, item: SpooledObject, state: State, reason: str | None =
 
 @contextmanager
 def index_of(root: Path) -> Iterator[Index]:
-    """The index as somebody else opens it."""
+    """The index, opened as another process would."""
     with closing(Index(root / 'index.db')) as index:
         index.open()
         yield index
 
 
 def uncataloged(root: Path, limit: int = 99) -> list[UncatalogedObject]:
-    """The oldest of what no part of the catalog has a row of yet."""
+    """The oldest objects that are not in any catalog part yet."""
     with index_of(root) as index:
         return index.catalog.uncataloged(limit)
 
@@ -96,7 +96,7 @@ def clear_uncataloged(root: Path) -> None:
 
 
 def rows(root: Path) -> list[dict[str, Any]]:
-    """All object rows, read by somebody else, who minds no flipped bit in the words of what has left the spool."""
+    """All object rows, read over a separate connection that tolerates invalid UTF-8 in rows of objects that left the spool."""
     connection = sqlite3.connect(root / 'index.db')
     connection.text_factory = lambda text: text.decode(errors='replace')
     connection.row_factory = sqlite3.Row
@@ -114,14 +114,14 @@ def files(root: Path) -> dict[str, bytes]:
 
 
 def place_of(row: dict[str, Any]) -> str:
-    """Where the file of a row has to be."""
+    """The expected path of a row's file."""
     state = State(row['state'])
     reason = '' if state in {State.PENDING, State.KEPT} else f'/{row["reason"] or "unknown"}'
     return f'{IN_SPOOL[state]}{reason}/{row["bucket"]}/{row["key"]}'
 
 
 def assert_whole(root: Path) -> dict[str, Any]:
-    """Every row in the spool has its whole file, every file its row, and the ledger closes; returns the ledger."""
+    """Every row in the spool has its complete file, every file its row, and the ledger balances; returns the ledger."""
     lying = files(root)
     expected = {}
     for row in rows(root):
@@ -138,7 +138,7 @@ def assert_whole(root: Path) -> dict[str, Any]:
 
 
 def reopened(opened: Callable[[], Spool], root: Path) -> dict[str, int]:
-    """Open, check that all is whole and that a commit and a delivery work, close; returns what recovery did."""
+    """Open, check that the spool is intact and can commit and deliver, close; returns what recovery did."""
     spool = opened()
     assert_whole(root)
     (item,) = put(spool, make('thor/after.jpg'))
@@ -153,7 +153,7 @@ def reopened(opened: Callable[[], Spool], root: Path) -> dict[str, int]:
 
 
 def abandon(spool: Spool) -> None:
-    """Leave a spool as a process that dies does."""
+    """Leave a spool as a killed process does."""
     spool._connections.writing.close()
     assert spool._session is not None
     os.close(spool._session._lock)
@@ -165,7 +165,7 @@ SELECT {} FROM objects, series WHERE id = (SELECT id FROM objects WHERE state = 
 
 
 def fill(root: Path, count: int) -> None:
-    """Add rows of as many delivered objects, without messages, to the index of a closed spool that has one of them."""
+    """Add rows of this many delivered objects, without messages, to the index of a closed spool that has one of them."""
     with closing(sqlite3.connect(root / 'index.db')) as db, db:
         columns = [row[1] for row in db.execute('PRAGMA table_info(objects)')]
         values = ', '.join({'id': 'NULL', 'key': "key || '-' || value", 'samples': '0'}.get(name, name) for name in columns)
@@ -173,10 +173,10 @@ def fill(root: Path, count: int) -> None:
 
 
 def damage_old_rows(root: Path) -> None:
-    """Make a page with rows of delivered objects unreadable, which no commit and no upload opens."""
+    """Make a page unreadable that holds rows of delivered objects and that no commit or upload reads."""
     path = root / 'index.db'
     content = bytearray(path.read_bytes())
     pages = range(len(content) // 4096 // 2 * 4096, len(content), 4096)
-    leaf = next(page for page in pages if content[page] == 13 and b'-' in content[page : page + 4096])  # a leaf of a table
+    leaf = next(page for page in pages if content[page] == 13 and b'-' in content[page : page + 4096])  # a leaf page of a table
     content[leaf : leaf + 4096] = bytes(4096)
     path.write_bytes(content)

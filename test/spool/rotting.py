@@ -1,4 +1,4 @@
-"""Damages a spool by chance, and finds out what a start makes of it; used by test_rot.py and by ``python -m torture.rot``."""
+"""Damages a spool at random, and checks how startup handles it; used by test_rot.py and by ``python -m torture.rot``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Damage = Callable[[random.Random, Path], None]
 
 
 def new_base(root: Path) -> dict[str, bytes]:
-    """The spool of a process that died at a bad moment, with objects in every state; the content of each by its key."""
+    """The spool of a process killed at a bad moment, with objects in every state; and the content of each by its key."""
     bodies = {f'thor/a/{number}.jpg': random.Random(number).randbytes(500 + number) for number in range(10)}
     bodies |= {'thor/held.jpg': b'held' * 50, 'thor/book.json': b'{}' * 50, 'thor/part.jpg': b'part' * 50}
     spool = new_spool(root)
@@ -34,11 +34,11 @@ def new_base(root: Path) -> dict[str, bytes]:
     settle(spool, items[1], State.QUARANTINED, 'refused')
     spool._connections.writing._db.execute('PRAGMA wal_checkpoint(TRUNCATE)')
     (part,) = put(spool, make('thor/part.jpg', bodies['thor/part.jpg']))
-    os.replace(part.path, root / 'incoming' / f'{part.id}.part')  # its rename had not happened yet
+    os.replace(part.path, root / 'incoming' / f'{part.id}.part')  # not renamed yet
     (root / 'incoming/99.part').write_bytes(b'never committed')
     receive(spool, 2)
     spool.commit()
-    # A closing connection would clear the log away: what is copied while it is open is what a kill leaves.
+    # A closing connection would delete the log: a copy made while it is open is what a kill leaves.
     for name in ('index.db', 'index.db-wal'):
         shutil.copy(root / name, root / f'{name}.kept')
     abandon(spool)
@@ -90,15 +90,15 @@ class Rotten:
 
     root: Path
     done: list[str]
-    """What was done to it."""
+    """The damage done to it."""
     planted: set[bytes]
-    """Contents of files that somebody put there."""
+    """Contents of foreign files placed there."""
     touched: set[str]
     """Keys whose file was damaged."""
 
 
 def rot(base: Path, root: Path, rng: random.Random) -> Rotten:
-    """Copy the spool and damage one to four of its files, or whole folders of it."""
+    """Copy the spool and damage one to four of its files, or entire folders."""
     shutil.copytree(base, root)
     rotten = Rotten(root, [], set(), set())
     for _ in range(rng.choice((1, 1, 2, 4))):
@@ -125,7 +125,7 @@ def _damage(rotten: Rotten, path: Path, rng: random.Random) -> None:
         return
     payload = not path.name.startswith('index')
     damage = rng.choice((*DAMAGES, _empty_folder) if payload else DAMAGES)
-    if path.name == 'index.db-wal' and damage is not _delete:  # then nobody sees that there was a commit of what has no name yet
+    if path.name == 'index.db-wal' and damage is not _delete:  # or nothing shows this commit
         rotten.touched.add('thor/part.jpg')
     before = path.read_bytes()
     damage(rng, path)
@@ -138,12 +138,12 @@ def _damage(rotten: Rotten, path: Path, rng: random.Random) -> None:
 
 
 def _key(path: Path) -> str:
-    """Whose file it is."""
+    """The key that a file belongs to."""
     return 'thor/part.jpg' if path.suffix == '.part' else path.as_posix().rpartition(f'{BUCKET}/')[2]
 
 
 def _plant(rotten: Rotten, rng: random.Random) -> None:
-    """A file that is none of the spool's."""
+    """Add a file that does not belong to the spool."""
     content = rng.randbytes(50)
     folder = rng.choice((READY, f'{READY}/thor/a', f'held/clock/{BUCKET}', f'quarantine/odd/{BUCKET}', 'incoming'))
     path = rotten.root / folder / rng.choice(('new.jpg', 'a b', '..x', 'x.part', '\N{SNOWMAN}'))
@@ -154,7 +154,7 @@ def _plant(rotten: Rotten, rng: random.Random) -> None:
 
 
 def _lose(rotten: Rotten, rng: random.Random) -> None:
-    """Whole folders, all of the index, or all that knows of the sessions."""
+    """Delete entire folders, the whole index, or every record of the sessions."""
     for name in rng.choice(LOSSES):
         path = rotten.root / name
         if path.is_dir():
@@ -167,7 +167,7 @@ def _lose(rotten: Rotten, rng: random.Random) -> None:
 
 
 def used(root: Path) -> Spool:
-    """Start, add and deliver; where damage shows in use only the process ends, and the next start looks closer."""
+    """Start, add and deliver; damage that only shows in use ends the process, and the next start checks more thoroughly."""
     for attempt in range(2):
         spool = new_spool(root)
         spool.open()
@@ -177,12 +177,12 @@ def used(root: Path) -> Spool:
             return spool
         except sqlite3.DatabaseError:
             abandon(spool)
-            assert attempt == 0, 'the second start found nothing either'
+            assert attempt == 0, 'the second start did not find the damage either'
     raise AssertionError
 
 
 def ship(spool: Spool) -> dict[str, bytes]:
-    """Deliver all that is pending, as the uploader does; what the store holds then."""
+    """Deliver everything pending, as the uploader does; returns the contents of the store afterwards."""
     store = MemoryStore()
     outcomes = []
     for item in spool.pending(1000):
@@ -199,18 +199,18 @@ def ship(spool: Spool) -> dict[str, bytes]:
 
 
 def check(rotten: Rotten, bodies: Mapping[str, bytes]) -> dict[str, int]:
-    """All that must hold of a spool, whatever happened to it; what recovery did."""
+    """Check the invariants of a spool after any damage; returns what recovery did."""
     spool = used(rotten.root)
     done = dict(+spool.recovery.counts)
     sent = ship(spool)
     whole = set(bodies.values()) | rotten.planted
-    assert all(body in whole for body in sent.values()), 'a damaged object was shipped as good'
+    assert all(body in whole for body in sent.values()), 'a damaged object was shipped as intact'
     quarantined = [row for row in rows(rotten.root) if row['state'] == 'quarantined']
     assert all(row['reason'] for row in quarantined)
     lying = {path.read_bytes() for path in rotten.root.rglob('*') if path.is_file()}
     for key, body in bodies.items():
-        if key not in rotten.touched and key != 'thor/a/0.jpg':  # that one was delivered before
-            assert body in sent.values() or body in lying, f'{key} is gone'
+        if key not in rotten.touched and key != 'thor/a/0.jpg':  # it was delivered before
+            assert body in sent.values() or body in lying, f'{key} is lost'
     assert rotten.planted <= set(sent.values()) | lying
     told = any('ledger' in what for what in done)
     assert told or ledger.imbalances(ledger.read(rotten.root, 'thor')) == []
@@ -218,6 +218,6 @@ def check(rotten: Rotten, bodies: Mapping[str, bytes]) -> dict[str, int]:
     again = new_spool(rotten.root)
     again.open()
     left = {what for what in again.recovery.counts if 'ledger' not in what}
-    assert not left, f'what was repaired stays repaired, but: {left}'
+    assert not left, f'a second start found more to repair: {left}'
     again.close()
     return done

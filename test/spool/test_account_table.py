@@ -1,4 +1,4 @@
-"""Objects with messages of several topics, in accounts of a separate sink, and the open messages of earlier sessions."""
+"""Objects with messages of several topics, in the accounts of a separate sink, and the open messages of earlier sessions."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ ODOM, IMU = f'{BAG}/odom', f'{BAG}/imu'
 
 
 def a_slice(number: int, **counts: int) -> DataObject:
-    """Of a bag, with so many messages of each topic."""
+    """A slice of a bag, with this many messages of each topic."""
     accounts = {f'{BAG}/{name}': count for name, count in counts.items()}
     return make(f'thor/rosbags/b/b_{number}.mcap', b'%d' % number, sensor='bag', topic=None, samples=sum(counts.values()),
                 counts=accounts)  # fmt: skip
 
 
 def bags(root: Path) -> dict[str, tuple[int, int, dict[str, int], int]]:
-    """Topic -> (received, stored, dropped, open), of a ledger that balances and agrees with the files."""
+    """Topic -> (received, stored, dropped, open), from a ledger that balances and agrees with the files."""
     found = ledger.read(root, 'thor')
     assert ledger.imbalances(found) == []
     with index_of(root) as index:
@@ -52,32 +52,32 @@ def started(root: Path, clock: FakeClock) -> Spool:
 
 
 def find(spool: Spool, item: DataObject) -> None:
-    """What recovery does with a slice that was left behind."""
+    """Have recovery process a slice that was left behind."""
     spool.accounts.carried.recover(item.counts, runs(item))
     spool.commit([item])
 
 
 def runs(item: DataObject) -> dict[str, list[NumberRun]]:
-    """The numbers of a slice's messages, where it has all of the publisher."""
+    """The numbers of a slice's messages, if it has all messages of the publisher."""
     return {topic: [NumberRun(1, 1 + count, NO_TIMES, NO_TIMES)] for topic, count in item.counts.items()}
 
 
 def die(spool: Spool, root: Path) -> Path:
-    """What another process would find after a SIGKILL of this one."""
+    """Return the spool that another process would find after a SIGKILL of this one."""
     copy = root.with_name(f'{root.name}-copy')
     shutil.copytree(root, copy)
     return copy
 
 
 def killed(spool: Spool, root: Path) -> Path:
-    """What a session leaves that recorded ten messages and died before it spooled a slice."""
+    """The state after a session that recorded ten messages and was killed before it spooled a slice."""
     receive(spool, 10, IMU)
     spool.commit()
     return die(spool, root)
 
 
 def test_a_slice_counts_for_each_of_its_topics(spool: Spool, root: Path) -> None:
-    """Its messages are stored in the bags' accounts, none in the sensors', and follow the object from state to state."""
+    """Its messages are stored in the accounts of the bags, not of the sensors, and follow the object from state to state."""
     receive(spool, 3, IMU)
     receive(spool, 2, ODOM)
     first, second = spool.commit([a_slice(0, imu=2, odom=2), a_slice(1, imu=1)])
@@ -91,7 +91,7 @@ def test_a_slice_counts_for_each_of_its_topics(spool: Spool, root: Path) -> None
 
 
 def test_totals_stay_when_slices_are_forgotten(opened: Open, root: Path, clock: FakeClock) -> None:
-    """The rows of what was delivered long ago go, with what they held, and the sums do not change."""
+    """The rows of old delivered slices are removed with their contents, and the totals do not change."""
     spool = opened(remember_days=1.0)
     receive(spool, 3, IMU)
     (item,) = spool.commit([a_slice(0, imu=3)])
@@ -106,7 +106,6 @@ def test_totals_stay_when_slices_are_forgotten(opened: Open, root: Path, clock: 
 
 
 def test_a_lost_index_is_rebuilt_with_what_slices_hold(opened: Open, root: Path) -> None:
-    """Their files tell it."""
     spool = opened()
     receive(spool, 3, IMU)
     spool.commit([a_slice(0, imu=3)])
@@ -124,7 +123,7 @@ def test_a_lost_index_is_rebuilt_with_what_slices_hold(opened: Open, root: Path)
 def test_open_messages_of_a_dead_session_are_settled_from_its_files(
     opened: Open, root: Path, clock: FakeClock, recorded: int, expected: tuple[object, ...]
 ) -> None:
-    """Found again it is stored, else lost by the restart; what the accounts had not known yet is received as well."""
+    """Messages found again are stored, others are lost by restart; those missing from the accounts are received as well."""
     left = killed(opened(), root)
     after = started(left, clock)
     assert bags(left) == {'/imu': (10, 0, {}, 10)}
@@ -136,7 +135,7 @@ def test_open_messages_of_a_dead_session_are_settled_from_its_files(
 
 
 def test_messages_missing_from_a_slice_were_lost_after_its_last_message(opened: Open, root: Path, clock: FakeClock) -> None:
-    """On both clocks: bags are dated by arrival, so a slice that is durable alone does not say which stamp its messages have."""
+    """On both clocks: bags are dated by arrival, so a slice that is durable alone does not contain the stamps of its messages."""
     spool = opened()
 
     def at(second: float) -> Times:
@@ -163,7 +162,7 @@ def test_messages_missing_from_a_slice_were_lost_after_its_last_message(opened: 
 
 
 def test_each_process_settles_its_own_bags(opened: Open, root: Path, clock: FakeClock) -> None:
-    """What a killed ``bag record`` left open is not the node's to give up: its file is found by the next ``bag record``."""
+    """A node does not give up what a killed ``bag record`` left open: the next ``bag record`` finds the file."""
     opened().close()
     recording = Spool(root, SpoolSettings(min_free_bytes=0), clock, 'thor records')
     recording.open()
@@ -183,7 +182,7 @@ def test_each_process_settles_its_own_bags(opened: Open, root: Path, clock: Fake
 
 
 def test_a_kill_during_settling_costs_nothing(opened: Open, root: Path, clock: FakeClock) -> None:
-    """What one session carried and did not settle is carried by the next."""
+    """Open messages that one session inherited and did not settle are inherited by the next."""
     first = killed(opened(), root)
     after = started(first, clock)
     find(after, a_slice(0, imu=4))
@@ -197,7 +196,7 @@ def test_a_kill_during_settling_costs_nothing(opened: Open, root: Path, clock: F
 
 
 def test_messages_open_at_a_stop_wait_for_the_next_start(opened: Open, root: Path) -> None:
-    """A slice that could not be spooled in time is not lost; messages of sensors have nobody who looks for them."""
+    """A slice that missed the deadline is not lost; open messages of sensors are dropped, since nothing finds them."""
     spool = opened()
     receive(spool, 5, IMU)
     receive(spool, 2, '/imu')
@@ -210,7 +209,7 @@ def test_messages_open_at_a_stop_wait_for_the_next_start(opened: Open, root: Pat
 
 
 def test_found_messages_are_counted_once_whatever_is_killed_next(opened: Open, root: Path, clock: FakeClock) -> None:
-    """A session that found messages and dies before the next one comes leaves no gap for them to the session after it."""
+    """A session that found messages and is killed before the next one arrives leaves no gap for them to the following session."""
     first = killed(opened(), root)
     second = started(first, clock)
     find(second, a_slice(0, imu=14))
@@ -228,7 +227,7 @@ def test_found_messages_are_counted_once_whatever_is_killed_next(opened: Open, r
 def test_a_recorded_message_is_not_missed_as_well(
     opened: Open, root: Path, clock: FakeClock, found_first: bool, is_told: bool
 ) -> None:
-    """Numbers that the accounts of the dead session did not reach are in its file: the gap before the next one is shorter."""
+    """Numbers missing from the killed session's accounts are in its file: the gap before the next number is shorter."""
     left = killed(opened(), root)
     after = started(left, clock)
     item = a_slice(0, imu=14)

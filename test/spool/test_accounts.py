@@ -46,35 +46,35 @@ def figures(span: Span) -> tuple[int, int, dict[str, int]]:
 
 
 def test_accounting_begins_with_the_first_number_taken() -> None:
-    """What a publisher sent before the match is nobody's loss."""
+    """What a publisher sent before it was matched is not counted as a loss."""
     span = Span()
     assert taken(span, 500, 501) == [True, True]
     assert figures(span) == (2, 2, {})
 
 
 def test_a_gap_is_missed_by_transport() -> None:
-    """Numbers that were jumped over are published and missed."""
+    """Skipped numbers are published and missed."""
     span = Span()
     taken(span, 1, 5)
     assert figures(span) == (5, 2, {'transport': 3})
 
 
 def test_a_repeat_is_counted_once() -> None:
-    """The same number again is refused, wherever it lies."""
+    """A repeated number is refused, whether it is old or new."""
     span = Span()
     assert taken(span, 7, 8, 8, 7) == [True, True, False, False]
     assert figures(span) == (2, 2, {})
 
 
 def test_a_late_number_fills_its_hole() -> None:
-    """A number that was missed and comes after all is received, once."""
+    """A missed number that arrives late is received, once."""
     span = Span()
     assert taken(span, 1, 4, 3, 3) == [True, True, True, False]
     assert figures(span) == (4, 3, {'transport': 1})
 
 
 def test_history_before_the_first_number_is_received() -> None:
-    """TRANSIENT_LOCAL history that comes after a live message counts once and makes no gap."""
+    """TRANSIENT_LOCAL history that arrives after a live message counts once and makes no gap."""
     span = Span()
     assert taken(span, 10, 8, 9, 8, 11) == [True, True, True, False, True]
     assert figures(span) == (4, 4, {})
@@ -93,7 +93,7 @@ def test_history_taken_before_a_restart_is_not_taken_again() -> None:
 
 
 def test_an_entry_holds_the_lock_as_long_as_it_is_entered() -> None:
-    """Also until an error in it; what was changed meanwhile is in the next snapshot."""
+    """It is held until an error inside the block, too; changes made during that time are in the next snapshot."""
     accounts = Accounts()
     with pytest.raises(ZeroDivisionError), accounts.entry('/map') as account:
         account.received += 1 // 0
@@ -118,21 +118,21 @@ def test_the_gap_of_a_restart_has_its_cause() -> None:
 
 
 def test_history_does_not_hide_the_restart() -> None:
-    """A message from before the inherited span leaves the cause of the gap after it as it is."""
+    """A message from before the inherited span does not change the cause of the gap after it."""
     span = Span(first=50, last=100, inherited=True)
     assert taken(span, 40, 103) == [True, True]
     assert figures(span) == (4, 2, {'restart': 2})
 
 
 def test_a_late_number_of_a_restart_fills_its_hole() -> None:
-    """A message that overtook others after a restart does not make them repeats."""
+    """A message that overtook others after a restart does not turn them into repeats."""
     span = Span(first=1, last=10, inherited=True)
     assert taken(span, 13, 12) == [True, True]
     assert figures(span) == (3, 2, {'restart': 1})
 
 
 def test_messages_of_the_previous_session_are_counted_by_their_numbers() -> None:
-    """They come again as repeats; what is missing between them and after them is missed by the restart."""
+    """They arrive again as repeats; numbers missing between and after them are missed by the restart."""
     span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert span.recover([run(7, 13, 70, 120), run(15, 18, 150, 170)], 5)
     assert taken(span, 12, 17, 20) == [False, False, True]
@@ -140,7 +140,7 @@ def test_messages_of_the_previous_session_are_counted_by_their_numbers() -> None
 
 
 def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> None:
-    """Though the message before it is in none."""
+    """The message before it is not in any file."""
     span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert span.recover([run(11, 13, 110, 120)], 2)
     assert taken(span, 13) == [True]
@@ -151,7 +151,7 @@ def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> Non
     [run(1, 6, 101, 150)], [run(12, 17, 120, 160)], [run(10, 13, 500, 520)], [run(10, 16, 101, 150)], [],
 ])  # fmt: skip
 def test_numbers_that_may_be_of_another_publisher_are_not_used(runs: list[NumberRun]) -> None:
-    """Then so many messages are counted, and whatever number comes next is a message as any other."""
+    """Then only the number of messages is counted, and the next sequence number is treated like any other."""
     span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert not span.recover(runs, 5)
     span.add_unnumbered(5)
@@ -160,7 +160,7 @@ def test_numbers_that_may_be_of_another_publisher_are_not_used(runs: list[Number
 
 
 def test_a_counted_gap_is_filled_by_messages_in_a_file() -> None:
-    """Where the next message came before the file was read; what it lacks stays missed, and may still come."""
+    """If the next message arrived before the file was read; numbers not in the file stay missed, and may still arrive."""
     span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert taken(span, 20) == [True]
     assert span.recover([run(5, 13, 50, 120), run(14, 16, 140, 150)], 4)
@@ -169,7 +169,7 @@ def test_a_counted_gap_is_filled_by_messages_in_a_file() -> None:
 
 
 def test_numbers_in_a_file_are_the_low_32_bits() -> None:
-    """As MCAP has them: those of the publisher's last number are added."""
+    """As in MCAP: the high bits of the publisher's last number are added."""
     span = Span(first=1, last=(1 << 32) - 2, inherited=True, last_times=by_arrival(100))
     assert span.recover([run((1 << 32) - 2, 1 << 32, 100, 110)], 1)
     assert span.recover([run(0, 2, 120, 130)], 2)
@@ -178,7 +178,7 @@ def test_numbers_in_a_file_are_the_low_32_bits() -> None:
 
 
 def test_after_a_rebase_the_gap_is_not_missed() -> None:
-    """What was published while nobody listened on purpose is not published for the ledger."""
+    """What was published during a pause is not published for the ledger."""
     span = Span()
     taken(span, 1, 2)
     span.rebase()
@@ -196,7 +196,7 @@ def test_a_rebase_makes_no_repeat_new() -> None:
 
 
 def test_the_newest_holes_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Memory of holes is bounded, and old holes, which nothing fills any more, make way for new ones."""
+    """Memory for holes is bounded: old holes, which are unlikely to be filled, are replaced by new ones."""
     monkeypatch.setattr(module, 'MAX_RANGES', 2)
     span = Span()
     taken(span, 0, 2, 6, 8)  # holes 1, 3..5, then 7
@@ -206,7 +206,7 @@ def test_the_newest_holes_are_remembered(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @given(st.lists(st.tuples(st.sampled_from('atx'), st.integers(0, 40)), max_size=60))
 def test_ranges_are_sets_of_numbers(steps: list[tuple[str, int]]) -> None:
-    """Whatever is appended, added and taken out, in any order."""
+    """For any order of append, add and remove."""
     ranges, numbers = Ranges(), set[int]()
     for what, number in steps:
         if what == 'a':
@@ -228,7 +228,7 @@ def test_ranges_are_sets_of_numbers(steps: list[tuple[str, int]]) -> None:
 
 
 def test_a_publisher_that_leaps_takes_little_memory() -> None:
-    """It chooses its numbers, in the network: neither a gap of billions nor many small ones are remembered one by one."""
+    """It chooses its numbers, over the network: neither a gap of billions nor many small gaps are remembered one by one."""
     span = Span()
     taken(span, *range(0, 100_000, 2), 1 << 62)
     taken(span, *range(-1, -100_000, -2))
@@ -241,7 +241,7 @@ def test_a_publisher_that_leaps_takes_little_memory() -> None:
 
 
 def test_invalid_sequence_numbers_stop_no_commit(opened: Open, root: Path) -> None:
-    """They come from the network: sums of them that SQLite could not hold, or a start would take for damage, are not believed."""
+    """They come from the network: numbers with sums that SQLite cannot hold, or that startup takes for damage, are ignored."""
     spool = opened()
     for publisher in range(2 * MAX_PUBLISHERS):
         with spool.accounts.entry('/odom') as account:
@@ -256,7 +256,7 @@ def test_invalid_sequence_numbers_stop_no_commit(opened: Open, root: Path) -> No
 
 
 def test_publishers_that_come_and_go_are_summed(opened: Open, root: Path) -> None:
-    """Only some have accounts of their own, in memory and in the index; both identities hold exactly, and no gap is lost."""
+    """Only some have separate accounts, in memory and in the index; both identities hold exactly, and no gap is lost."""
     spool = opened()
     for number in range(3000):
         with spool.accounts.entry('/odom') as account:
@@ -279,7 +279,7 @@ def test_publishers_that_come_and_go_are_summed(opened: Open, root: Path) -> Non
 
 
 def test_a_summed_publisher_that_returns_is_counted_again(opened: Open, root: Path) -> None:
-    """What it published meanwhile is missed, what it sends again is a repeat; in the next session it is where it was."""
+    """What it published in between is missed, what it repeats is a repeat; in the next session it continues where it was."""
     spool = opened()
     receive(spool, 10, '/odom', 'robot')
     spool.close()
@@ -340,7 +340,7 @@ def test_published_is_received_and_missed(numbers: list[int], rebases: set[int],
 
 @given(NUMBERS)
 def test_every_new_number_is_received(numbers: list[int]) -> None:
-    """Without a former session, received is the number of distinct numbers, and missed the holes above the first taken."""
+    """Without an earlier session, received is the number of distinct numbers, and missed the holes above the first one."""
     span = Span()
     for number in numbers:
         span.observe(number)
@@ -351,7 +351,7 @@ def test_every_new_number_is_received(numbers: list[int]) -> None:
 
 
 def test_without_a_number_a_message_is_only_received() -> None:
-    """Accounting without numbers is not called exact."""
+    """Accounting without sequence numbers is not called exact."""
     account = TopicAccount()
     assert account.receive('p', 1)
     assert account.accounting == EXACT
@@ -361,7 +361,7 @@ def test_without_a_number_a_message_is_only_received() -> None:
 
 
 def test_before_the_first_message_nothing_is_known() -> None:
-    """A topic that was not heard has not missed 0."""
+    """For a topic that was not received, missed is unknown, not 0."""
     assert (TopicAccount().missed, TopicAccount().missed_estimated) == (None, None)
 
 
@@ -373,7 +373,6 @@ def test_two_publishers_have_separate_numbers() -> None:
 
 
 def test_open_is_what_has_no_outcome() -> None:
-    """Each message is open until it is skipped, rejected, dropped or stored."""
     accounts = Accounts()
     with accounts.entry('/odom') as account:
         for number in range(10):
@@ -388,7 +387,7 @@ def test_open_is_what_has_no_outcome() -> None:
 
 
 def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
-    """A snapshot counts the samples of its own commit as stored; without a change there is none."""
+    """A snapshot counts the samples in its commit as stored; if nothing changed there is no snapshot."""
     accounts = Accounts()
     with accounts.entry('/odom') as account:
         account.receive('p', 5)
@@ -403,14 +402,14 @@ def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
 
 
 def test_samples_of_an_unreceived_topic_are_detected() -> None:
-    """An object of a topic without an account makes the topic's account negative at once, not silently nothing."""
+    """An object of a topic without an account makes the topic's account negative immediately instead of being ignored."""
     snapshot = Accounts().snapshot({'/ghost': (2, by_arrival(1))})
     assert snapshot is not None
     assert [(row.topic, row.open) for row in snapshot.topics] == [('/ghost', -2)]
 
 
 def test_the_last_stored_stamp_is_inherited() -> None:
-    """A restarted node goes on sampling after the newest durable sample of any session."""
+    """A restarted node continues to sample after the newest durable sample of any session."""
     accounts = Accounts(last_stored={'/odom': by_arrival(50)})
     assert accounts.last_stored_ns('/odom') == 50
     accounts.store({'/odom': (1, by_arrival(40))})
@@ -419,7 +418,7 @@ def test_the_last_stored_stamp_is_inherited() -> None:
 
 
 def test_messages_of_another_type_are_received_and_rejected(opened: Open, root: Path) -> None:
-    """Not one is the topic's own or missed; both identities hold, across sessions, and what nobody counted is not known."""
+    """None is the topic's own or missed; both identities hold, across sessions, and what was not counted is unknown."""
     for counted in (True, False):
         spool = opened()
         receive(spool, 5, '/odom')
@@ -438,7 +437,7 @@ def test_messages_of_another_type_are_received_and_rejected(opened: Open, root: 
 
 
 def test_the_number_of_other_types_is_limited() -> None:
-    """Whoever invents types fills no memory: beyond some they are one, of which nothing is counted."""
+    """A client that invents types cannot fill memory: above a limit they share one entry, and nothing of it is counted."""
     accounts = Accounts()
     for number in range(1000):
         accounts.add_other_type('/odom', f'b/msg/B{number}', [f'/{number}'], counted=True, named=True)
@@ -451,7 +450,7 @@ def test_the_number_of_other_types_is_limited() -> None:
 
 
 def test_without_a_configured_type_losses_are_unknown() -> None:
-    """Where another type is published and not counted, what was missed of the topic is unknown, and not 0."""
+    """If another type is published and not counted, missed is unknown for the topic, not 0."""
     accounts = Accounts()
     with accounts.entry('/odom') as account:
         account.receive('p', 1)

@@ -30,7 +30,7 @@ ROUNDS = examples(40)
 
 @pytest.fixture(scope='module')
 def base(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, bytes]]:
-    """The spool of a process that died, and the content of each of its objects."""
+    """The spool of a killed process, and the content of each of its objects."""
     root = tmp_path_factory.mktemp('base') / 'spool'
     return root, rotting.new_base(root)
 
@@ -40,7 +40,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, byte
 def test_after_random_damage_nothing_damaged_is_sent_and_nothing_intact_is_lost(
     base: tuple[Path, dict[str, bytes]], tmp_path: Path, part: int
 ) -> None:
-    """After any damage a start works, no damaged object is shipped, what is whole is kept, and the ledger closes or tells."""
+    """After any damage startup works, damaged objects are not shipped, intact ones are, and the ledger balances or reports it."""
     root, bodies = base
     for seed in range(part, ROUNDS, 4):
         rotten = rotting.rot(root, tmp_path / 'rotten', random.Random(seed))
@@ -52,7 +52,7 @@ def test_after_random_damage_nothing_damaged_is_sent_and_nothing_intact_is_lost(
 
 
 def test_damage_is_detected_before_the_put(opened: Open, root: Path) -> None:
-    """A flipped bit in a file of the right size is found before it is sent: the object is quarantined as damaged."""
+    """A flipped bit in a file of the correct size is found before it is sent: the object is quarantined as damaged."""
     spool = opened()
     put(spool, make('good', b'good'), make('bad', b'bad'))
     (root / READY / 'bad').write_bytes(b'bae')
@@ -65,7 +65,7 @@ def test_damage_is_detected_before_the_put(opened: Open, root: Path) -> None:
 
 @pytest.mark.parametrize('held', [None, 'clock'])
 def test_a_committed_part_survives_the_loss_of_the_index(opened: Open, root: Path, held: str | None) -> None:
-    """What was committed but not yet in its place survives the loss of the index, by what it says of itself."""
+    """An object that is committed but not yet in its place is restored from its file's description."""
     spool = opened()
     put(spool, make('a/part', b'part', held=held))
     spool.close()
@@ -81,7 +81,7 @@ def test_a_committed_part_survives_the_loss_of_the_index(opened: Open, root: Pat
 
 
 def test_a_truncated_part_is_not_adopted(opened: Open, root: Path) -> None:
-    """A part that is not what it says of itself was not committed."""
+    """A part that differs from its own description was not committed."""
     spool = opened()
     put(spool, make('a/part', b'part'))
     spool.close()
@@ -92,7 +92,7 @@ def test_a_truncated_part_is_not_adopted(opened: Open, root: Path) -> None:
 
 
 def test_a_damaged_row_does_not_stop_delivery(opened: Open, root: Path) -> None:
-    """Damage inside a row, which SQLite cannot see, does not stop the delivery of all others: the index is rebuilt."""
+    """Damage inside a row, which SQLite cannot see, does not stop the delivery of others: the index is rebuilt."""
     spool = opened()
     put(spool, make('a'), make('b'))
     with spool._connections.writing.transaction():
@@ -104,7 +104,7 @@ def test_a_damaged_row_does_not_stop_delivery(opened: Open, root: Path) -> None:
 
 
 def test_an_unbalanced_ledger_is_reported(opened: Open, root: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A total that was damaged in the index is said at every start, and costs nothing else."""
+    """A total damaged in the index is reported at every start, and has no other effect."""
     spool = opened()
     put(spool, make('a'))
     with spool._connections.writing.transaction():
@@ -118,7 +118,7 @@ def test_an_unbalanced_ledger_is_reported(opened: Open, root: Path, caplog: pyte
 
 @pytest.mark.parametrize('kind', ['file', 'folder', 'link'])
 def test_anything_at_the_path_of_a_part_is_set_aside(opened: Open, root: Path, tmp_path: Path, kind: str) -> None:
-    """What lies where the next part is to be written is set aside, not written over, and stops no commit."""
+    """Anything at the path of the next part is set aside, not overwritten, and stops no commit."""
     outside = tmp_path / 'outside'
     outside.write_bytes(b'theirs')
     spool = opened()
@@ -139,7 +139,7 @@ def test_anything_at_the_path_of_a_part_is_set_aside(opened: Open, root: Path, t
 
 
 def test_links_are_not_followed(opened: Open, root: Path, used: dict[str, bytes], tmp_path: Path) -> None:
-    """Links to files and folders are neither adopted nor read, also in an object's place, and are left alone."""
+    """Links to files and folders, also in place of an object, are neither adopted nor read, and are not changed."""
     outside = tmp_path / 'outside'
     outside.mkdir()
     (outside / 'secret').write_bytes(b'2')
@@ -162,7 +162,7 @@ def test_links_are_not_followed(opened: Open, root: Path, used: dict[str, bytes]
 def test_files_with_names_that_cannot_be_keys_are_set_aside(
     opened: Open, root: Path, used: dict[str, bytes], name: bytes
 ) -> None:
-    """A file that cannot be an object is set aside, not deleted, and over nothing."""
+    """A file that cannot be an object is set aside without deleting or overwriting anything."""
     for content in (b'first', b'second'):
         path = Path(os.fsdecode(os.fsencode(root) + b'/' + name))
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -172,7 +172,7 @@ def test_files_with_names_that_cannot_be_keys_are_set_aside(
 
 
 def test_files_outside_the_buckets_are_left_alone(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """What lies beside the buckets, in incoming under a foreign name or is not a file is nobody's object."""
+    """Foreign files next to the buckets, with foreign names in incoming, or that are not regular files, are ignored."""
     (root / 'ready/README').write_text('mine')
     (root / 'held/clock.txt').write_text('mine')
     (root / 'incoming/notes.txt').write_text('mine')
@@ -203,7 +203,7 @@ def test_a_file_copied_by_hand_is_adopted(opened: Open, root: Path, used: dict[s
 def test_a_file_with_an_implausible_description_is_adopted_without_it(
     opened: Open, root: Path, used: dict[str, bytes], attribute: bytes
 ) -> None:
-    """Of what a file says of itself only what makes sense is believed."""
+    """Implausible values in a file's description are ignored."""
     path = root / READY / 'thor/odd.bin'
     path.write_bytes(b'odd')
     try:
@@ -216,7 +216,7 @@ def test_a_file_with_an_implausible_description_is_adopted_without_it(
 
 
 def test_a_file_with_other_content_is_not_adopted(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """Content that differs from its own description is not adopted as if it were whole."""
+    """Content that differs from its own description is not adopted as intact."""
     path = root / READY / 'thor/odd.bin'
     path.write_bytes(b'changed')
     os.setxattr(path, ATTRIBUTE, json.dumps({'sha256': '0' * 64}).encode())
@@ -226,7 +226,7 @@ def test_a_file_with_other_content_is_not_adopted(opened: Open, root: Path, used
 def test_an_unreadable_file_stops_nothing(
     opened: Open, root: Path, used: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Somebody else's unreadable file is left where it is."""
+    """An unreadable file of another user is left in place."""
     path = root / READY / 'thor/theirs.bin'
     path.write_bytes(b'x')
     open_file = Path.open
@@ -257,7 +257,7 @@ def test_files_set_aside_never_overwrite_others(root: Path) -> None:
 
 @pytest.mark.parametrize('damage', ['deleted', 'garbage', 'empty', 'half', 'zeroed pages', 'header', 'version 0'])
 def test_a_lost_index_is_rebuilt_from_the_files(opened: Open, root: Path, used: dict[str, bytes], damage: str) -> None:
-    """The index is rebuilt from the files: every object in the spool is known again, with what it said of itself."""
+    """Every object in the spool is known again, with its description."""
     before = {row['key']: row for row in rows(root) if row['state'] != 'delivered'}
     path = root / 'index.db'
     content = path.read_bytes()
@@ -285,7 +285,7 @@ def test_a_lost_index_is_rebuilt_from_the_files(opened: Open, root: Path, used: 
 
 
 def test_every_damaged_index_is_kept(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """A second damaged index is set aside beside the first."""
+    """A second damaged index is set aside next to the first."""
     for number in (1, 2):
         (root / 'index.db').write_bytes(b'garbage' * 1000)
         opened().close()
@@ -293,7 +293,7 @@ def test_every_damaged_index_is_kept(opened: Open, root: Path, used: dict[str, b
 
 
 def test_many_files_are_adopted_in_groups(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rebuild of more files than one group takes all of them."""
+    """A rebuild of more files than one group adopts all of them."""
     monkeypatch.setattr(adoption, 'GROUP_FILES', 3)
     spool = opened()
     put(spool, *(make(f'{number}') for number in range(10)))
@@ -304,7 +304,7 @@ def test_many_files_are_adopted_in_groups(opened: Open, root: Path, monkeypatch:
 
 
 def test_rebuilt_indexes_give_out_different_numbers(opened: Open, root: Path, clock: FakeClock) -> None:
-    """A process that lives with the index before may be about to name a part by a number of that."""
+    """A process that still uses the old index may be about to use one of its numbers for a part."""
     spools = [opened()]
     put(spools[0], *(make(f'{number}') for number in range(30)))
     numbers: list[int] = []
@@ -321,7 +321,7 @@ def test_rebuilt_indexes_give_out_different_numbers(opened: Open, root: Path, cl
 
 
 def test_a_lost_write_ahead_log_costs_no_file(opened: Open, root: Path) -> None:
-    """When the index goes back in time, the files written since are adopted again."""
+    """If the index reverts to an earlier state, files written since are adopted again."""
     spool = opened()
     put(spool, make('old'))
     spool._connections.writing._db.execute('PRAGMA wal_checkpoint(TRUNCATE)')
@@ -337,7 +337,7 @@ def test_a_lost_write_ahead_log_costs_no_file(opened: Open, root: Path) -> None:
 
 
 def test_a_truncated_write_ahead_log_is_accepted(opened: Open, root: Path) -> None:
-    """A log cut in its middle, as a power cut leaves it, starts."""
+    """The spool starts with a log that a power cut truncated."""
     spool = opened()
     put(spool, make('old'))
     put(spool, make('new', b'new'))
@@ -350,7 +350,7 @@ def test_a_truncated_write_ahead_log_is_accepted(opened: Open, root: Path) -> No
 
 
 def test_an_index_of_a_newer_version_is_refused(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """A newer program's index is refused and left as it is."""
+    """The index of a newer program is refused and not changed."""
     with sqlite3.connect(root / 'index.db') as connection:
         connection.executescript(f'CREATE TABLE newer (id); PRAGMA user_version = {SCHEMA_VERSION + 1}')
     connection.close()
@@ -361,7 +361,7 @@ def test_an_index_of_a_newer_version_is_refused(opened: Open, root: Path, used: 
 
 
 def test_a_locked_index_is_not_damaged(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An index that another program locks is an error to say, not a reason to begin anew."""
+    """An index locked by another program raises an error, and is not rebuilt."""
     opened().close()
     monkeypatch.setattr('shadowhound_data_logger.spool.index.BUSY_TIMEOUT_S', 0.05)
     connection = sqlite3.connect(root / 'index.db', isolation_level=None)
@@ -373,7 +373,7 @@ def test_a_locked_index_is_not_damaged(opened: Open, root: Path, monkeypatch: py
 
 
 def test_a_rebuilt_key_is_not_given_out_again(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """After a rebuild new objects get other keys than those in the spool."""
+    """After a rebuild new objects get keys different from those in the spool."""
     (root / 'index.db').unlink()
     assert put(opened(), make('thor/a/2.jpg', b'new'))[0].key == 'thor/a/2_1.jpg'
     assert_whole(root)
@@ -394,7 +394,7 @@ def test_the_same_key_in_two_folders_is_adopted_once(opened: Open, root: Path, u
 def test_without_readable_attributes_files_are_adopted_by_name(
     opened: Open, root: Path, used: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    """Without readable descriptions a rebuild knows the objects by name and content alone."""
+    """Without readable descriptions a rebuild has only the names and contents of the objects."""
 
     def fail(*_: Any) -> bytes:
         raise OSError(number, os.strerror(number))
@@ -406,7 +406,7 @@ def test_without_readable_attributes_files_are_adopted_by_name(
 
 
 def test_the_spool_works_on_a_file_system_without_attributes(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where files cannot carry a description the spool works, and only a rebuild knows less."""
+    """If files cannot carry a description the spool works, and only a rebuild has less information."""
 
     def fail(*_: Any) -> None:
         raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
@@ -422,7 +422,7 @@ def test_the_spool_works_on_a_file_system_without_attributes(opened: Open, root:
 
 @pytest.mark.parametrize('logs', [(), ('-wal', '-shm')])
 def test_an_index_replaced_while_in_use_loses_nothing(opened: Open, root: Path, logs: tuple[str, ...]) -> None:
-    """Who has it open can write no more, and is told to start again; another process goes on beside it, and nothing is lost."""
+    """Processes that have it open cannot write and are asked to restart; another process keeps working, and nothing is lost."""
     first = opened()
     put(first, make('old'))
     (root / 'index.db').rename(root / 'index.db.damaged-1')
@@ -450,7 +450,7 @@ def test_an_index_replaced_while_in_use_loses_nothing(opened: Open, root: Path, 
 
 @pytest.mark.parametrize('logs', [(), ('-wal',), ('-shm',), ('-wal', '-shm')])
 def test_an_index_deleted_while_in_use_is_restored(opened: Open, root: Path, logs: tuple[str, ...]) -> None:
-    """The next commit of a process that has it open puts it back with all that it knew; the others go on with the copy."""
+    """The next commit of a process that has it open restores it with all its rows; the others continue with the copy."""
     first, second = opened(), opened()
     (old,) = put(first, make('old'))
     put(second, make('beside', topic='/beside'))
@@ -470,7 +470,7 @@ def test_an_index_deleted_while_in_use_is_restored(opened: Open, root: Path, log
 
 
 def test_a_start_waits_for_an_index_that_was_deleted(opened: Open, root: Path) -> None:
-    """A process that lives puts it back within a second or so, and the one that starts finds the accounts."""
+    """A running process restores it within about a second, and the one that starts finds the accounts."""
     first = opened()
     put(first, make('old'))
     (root / 'index.db').unlink()

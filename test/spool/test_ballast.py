@@ -27,7 +27,7 @@ RESERVE = 4 * MEBI
 
 @pytest.fixture
 def root(tmp_path: Path) -> Iterator[Path]:
-    """The spool's folder on a file system of its own."""
+    """The spool's folder on a separate file system."""
     disk = tmp_path / 'disk'
     disk.mkdir()
     command = ['mount', '-t', 'tmpfs', '-o', f'size={DISK_BYTES}', 'none', str(disk)]
@@ -43,7 +43,7 @@ def disk(root: Path) -> Path:
 
 
 def fill(disk: Path) -> Path:
-    """Write until nothing is free."""
+    """Write until no space is free."""
     path = disk / 'filler'
     with path.open('ab', buffering=0) as file:
         while free(disk):
@@ -56,7 +56,7 @@ def free(disk: Path) -> int:
 
 
 def test_the_spool_evicts_on_a_disk_that_another_process_fills(root: Path, disk: Path, opened: Open) -> None:
-    """The ballast lets the spool write down what it evicts, so that it keeps the newest even where nothing was free."""
+    """The ballast lets the spool record evictions, so that it keeps the newest objects even when no space was free."""
     spool = opened(min_free_bytes=RESERVE)
     put(spool, make('event', bytes(MEBI), protected=True), *(make(f'{number}', bytes(MEBI)) for number in range(10)))
     filler = fill(disk)
@@ -73,7 +73,7 @@ def test_the_spool_evicts_on_a_disk_that_another_process_fills(root: Path, disk:
 
 
 def test_the_spool_starts_on_a_full_disk(root: Path, disk: Path, opened: Open) -> None:
-    """It works by the ballast; the index is not taken for damaged because SQLite cannot begin its log."""
+    """It uses the ballast; the index is not treated as damaged because SQLite cannot create its log."""
     spool = opened(min_free_bytes=RESERVE)
     put(spool, *(make(f'{number}', bytes(MEBI)) for number in range(12)))
     spool.close()
@@ -85,7 +85,7 @@ def test_the_spool_starts_on_a_full_disk(root: Path, disk: Path, opened: Open) -
 
 
 def test_a_start_without_any_space_fails_with_the_reason(root: Path, disk: Path, opened: Open) -> None:
-    """Without a ballast the start fails with the reason, and the index stays as it is for the next one."""
+    """Without a ballast the start fails with the reason, and the index is unchanged for the next one."""
     spool = opened(min_free_bytes=RESERVE)
     put(spool, make('old'))
     spool.close()
@@ -102,7 +102,7 @@ def test_a_start_without_any_space_fails_with_the_reason(root: Path, disk: Path,
 
 
 def test_no_ballast_where_there_is_little_space(root: Path, disk: Path, opened: Open) -> None:
-    """The ballast does not take what is to be left free."""
+    """The ballast does not use space that must stay free."""
     spool = opened(min_free_bytes=DISK_BYTES - ballast.BALLAST_BYTES // 2)
     put(spool, make('p', protected=True))
     assert not (root / 'ballast').exists()
@@ -132,11 +132,11 @@ def test_the_writer_loses_nothing_while_the_disk_accepts_nothing(
     root: Path, disk: Path, writing: Callable[..., tuple[Spool, SpoolWriter]], trouble: str,
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """The writer keeps all it has, tells at the beginning and at the end, and loses nothing once the disk takes it."""
+    """The writer keeps everything it has, reports the start and the end, and loses nothing once the disk accepts writes."""
     caplog.set_level(logging.INFO)
     monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
     monkeypatch.setattr(worker, 'LONGEST_PAUSE_S', 0.01)
-    monkeypatch.setattr(ballast, 'BALLAST_BYTES', DISK_BYTES)  # none
+    monkeypatch.setattr(ballast, 'BALLAST_BYTES', DISK_BYTES)  # no space
     spool, writer = writing()
     connection = spool._connections.writing._db
     receive(spool, 3)
@@ -157,7 +157,7 @@ def test_the_writer_loses_nothing_while_the_disk_accepts_nothing(
         connection.execute('PRAGMA query_only = 0')
     assert writer.flush(60)
     assert assert_whole(root)['topics']['/camera']['stored'] == 3
-    until(lambda: not writer.worker.failing)  # it says so after the commit
+    until(lambda: not writer.worker.failing)  # it is reported after the commit
     told = [record.getMessage() for record in caplog.records if record.name.endswith('worker')]
     assert len(told) == 2, told
     assert 'cannot be written' in told[0]
@@ -166,7 +166,7 @@ def test_the_writer_loses_nothing_while_the_disk_accepts_nothing(
 
 
 def test_an_io_error_is_a_full_disk_only_if_nothing_is_free(disk: Path) -> None:
-    """SQLite's word for a log that cannot be begun is a full disk only where nothing is free."""
+    """SQLite's error for a log that cannot be created is a full disk only if no space is free."""
     error = sqlite3.OperationalError('disk I/O error')
     assert not ballast.is_disk_full(error, disk)
     fill(disk)

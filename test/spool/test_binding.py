@@ -1,4 +1,4 @@
-"""Held objects get their final name at once or not at all, whatever happens in between, and only once."""
+"""Held objects get their final name completely or not at all, whatever happens in between, and only once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HELD = f'held/clock/{BUCKET}'
 
 
 def hold(spool: Spool, *names: str, **fields: Any) -> list[Binding]:
-    """Spool held objects; returns what they are to become."""
+    """Spool held objects; returns their final names."""
     put(spool, *(make(f'thor/provisional/{name}', name.encode(), **{'held': 'clock', **fields}) for name in names))
     return [final(item.id, item.key.rpartition('/')[2]) for item in spool.reading.objects.held('clock')]
 
@@ -34,7 +34,7 @@ def final(number: int, name: str) -> Binding:
 
 
 def test_held_objects_are_listed_oldest_first(spool: Spool) -> None:
-    """Those of one reason, as many as are asked for, with all that a binding is made from."""
+    """Those of one reason, up to the requested number, with everything a binding needs."""
     put(spool, *(make(f'k/{name}', held='clock', metadata={'name': name}) for name in 'cab'))
     put(spool, make('k/other', held='mission-7'), make('k/free'))
     one, two = spool.reading.objects.held('clock', 2)
@@ -44,7 +44,7 @@ def test_held_objects_are_listed_oldest_first(spool: Spool) -> None:
 
 
 def test_a_bound_object_is_pending_under_its_final_name(spool: Spool, root: Path) -> None:
-    """Row, file and what the file says of itself are those of the final name; content and its checksum stay."""
+    """Row, file and description have the final name; content and checksum are unchanged."""
     (binding,) = hold(spool, 'a')
     (item,) = spool.bind([binding])
     assert (item.key, item.path, item.path.read_bytes()) == ('thor/final/a', root / READY / 'thor/final/a', b'a')
@@ -60,7 +60,7 @@ def test_a_bound_object_is_pending_under_its_final_name(spool: Spool, root: Path
 
 
 def test_a_bound_object_counts_as_before(spool: Spool, root: Path) -> None:
-    """The ledger closes in between, and the samples of a bound object are delivered in the end."""
+    """The ledger balances, and the samples of a bound object are delivered in the end."""
     bindings = hold(spool, 'a', 'b', 'c')
     items = spool.bind(bindings[:2])
     assert assert_whole(root)['topics']['/camera']['stored_in']['held'] == 1
@@ -70,7 +70,7 @@ def test_a_bound_object_counts_as_before(spool: Spool, root: Path) -> None:
 
 
 def test_a_bound_object_keeps_its_topic(spool: Spool, root: Path) -> None:
-    """Under its final name too the file names the accounts: an index that is lost is made of files."""
+    """The file with the final name also names the accounts, since a lost index is rebuilt from files."""
     (binding,) = hold(spool, 'a', topic=None, counts={'bag:/imu': 3, 'bag:/odom': 1})
     before = description_of(root / HELD / 'thor/provisional/a')
     (item,) = spool.bind([binding])
@@ -80,7 +80,7 @@ def test_a_bound_object_keeps_its_topic(spool: Spool, root: Path) -> None:
 
 
 def test_final_names_are_unique(spool: Spool) -> None:
-    """A name that was given out, in the same call as well, is numbered; an object may keep the name that it has."""
+    """A name already used, also in the same call, gets a number; an object may keep its current name."""
     put(spool, make('thor/final/a'))
     one, two, three = hold(spool, 'a', 'b', 'c')
     same = Binding(two.id, 'thor/final/a', {}, 1, 2)
@@ -89,7 +89,7 @@ def test_final_names_are_unique(spool: Spool) -> None:
 
 
 def test_a_number_for_a_frequent_name_is_found_in_few_queries(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In turn, without a gap: an agent that numbers none of its frames must not keep the index from others."""
+    """Numbers are consecutive: an agent that numbers none of its frames must not block the index for others."""
     asked: list[str] = []
     row = ObjectTable.row
 
@@ -104,7 +104,7 @@ def test_a_number_for_a_frequent_name_is_found_in_few_queries(spool: Spool, monk
 
 
 def test_objects_no_longer_held_are_skipped(spool: Spool, opened: Open, root: Path) -> None:
-    """A second binding of an object, by another process say, changes nothing; nor does one of an object that left."""
+    """Binding an object a second time, for example by another process, changes nothing; nor does binding one that has left."""
     bindings = hold(spool, 'a', 'b')
     (done,) = opened().bind(bindings[:1])
     settle(spool, done, State.DELIVERED)
@@ -115,7 +115,7 @@ def test_objects_no_longer_held_are_skipped(spool: Spool, opened: Open, root: Pa
 
 
 def test_an_invalid_name_binds_nothing(spool: Spool, root: Path) -> None:
-    """One refused name leaves all objects as they were."""
+    """One refused name leaves all objects unchanged."""
     one, two = hold(spool, 'a', 'b')
     before = files(root)
     with pytest.raises(NameRefused):
@@ -125,7 +125,7 @@ def test_an_invalid_name_binds_nothing(spool: Spool, root: Path) -> None:
 
 
 def test_a_failing_disk_binds_nothing(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows, files and descriptions are as before, and the next try succeeds."""
+    """Rows, files and descriptions are unchanged, and the next try succeeds."""
     bindings = hold(spool, 'a', 'b')
     before = files(root)
 
@@ -145,7 +145,7 @@ def test_a_failing_disk_binds_nothing(spool: Spool, root: Path, monkeypatch: pyt
 
 
 def test_a_missing_file_does_not_block_others(spool: Spool, root: Path) -> None:
-    """It is bound like any other, so that delivery finds that it is missing."""
+    """It is bound like any other, and delivery finds that it is missing."""
     bindings = hold(spool, 'a', 'b')
     (root / HELD / 'thor/provisional/a').unlink()
     assert [item.path.exists() for item in spool.bind(bindings)] == [False, True]
@@ -153,7 +153,7 @@ def test_a_missing_file_does_not_block_others(spool: Spool, root: Path) -> None:
 
 
 def test_waiting_time_starts_once_the_clock_is_set(spool: Spool, root: Path, clock: FakeClock) -> None:
-    """An object of 1970 waits since its own end, once that is known, and not for half a century."""
+    """The waiting time of an object dated 1970 counts from its true end, once that is known, not from 1970."""
     clock.now_ns = 60
     bindings = hold(spool, 'a')
     clock.now_ns = NOON_NS + 10
@@ -164,7 +164,7 @@ def test_waiting_time_starts_once_the_clock_is_set(spool: Spool, root: Path, clo
 @pytest.mark.parametrize(('moment', 'state'), [('renamed', 'held'), ('synced', 'held'), ('bound', 'pending')])
 @pytest.mark.parametrize('index', ['kept', 'lost'])
 def test_a_binding_killed_between_two_steps_is_completed(opened: Open, root: Path, moment: str, state: str, index: str) -> None:
-    """Until it is committed all are held, from then on all are bound: rows, files and descriptions agree after the next start."""
+    """Before the commit all are held, after it all are bound: rows, files and descriptions agree after the next start."""
     with started('bind', root, moment) as child:
         assert child.wait(60) == -9
     assert sorted(name.split('/')[0] for name in files(root)) == ['incoming', 'incoming']
@@ -185,9 +185,9 @@ def test_a_binding_killed_between_two_steps_is_completed(opened: Open, root: Pat
     assert {item.key for item in spool.pending(9)} == {'thor/final/a', 'thor/final/b'}
 
 
-@pytest.mark.long('a death after each step')
+@pytest.mark.long('a kill after each step')
 def test_a_kill_at_any_moment_of_a_binding_loses_nothing(root: Path, moments: Moments) -> None:
-    """Objects are bound all or none; what is left can be bound and delivered, and the ledger closes."""
+    """All objects are bound or none; the rest can be bound and delivered, and the ledger balances."""
     spool = new_spool(root)
     spool.open()
     hold(spool, 'a', 'b', 'c')
@@ -222,7 +222,7 @@ def test_a_kill_at_any_moment_of_a_binding_loses_nothing(root: Path, moments: Mo
 
 
 def test_a_start_of_another_process_keeps_out_of_a_binding(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its recovery would put back what is renamed and not committed yet, and delivery find no file under the final name."""
+    """Its recovery would undo renames that are not committed yet, and delivery would find no file under the final name."""
     bindings = hold(spool, 'a', 'b')
     other = new_spool(root)
     start, looked = threading.Thread(target=other.open), threading.Event()
@@ -247,7 +247,7 @@ def test_a_start_of_another_process_keeps_out_of_a_binding(spool: Spool, root: P
 
 
 def test_an_interrupted_binding_is_completed(opened: Open, root: Path) -> None:
-    """Parts that a failing SQLite left in their place are bound by the next try, without a start in between."""
+    """Parts that a failing SQLite left in place are bound by the next try, without a restart in between."""
     spool = opened()
     bindings = hold(spool, 'a', 'b')
     (root / HELD / 'thor/provisional/a').rename(root / f'incoming/{bindings[0].id}.part')
@@ -256,7 +256,7 @@ def test_an_interrupted_binding_is_completed(opened: Open, root: Path) -> None:
 
 
 def test_held_objects_are_found_without_reading_the_rest(spool: Spool) -> None:
-    """A hundred thousand delivered objects cost it nothing."""
+    """A hundred thousand delivered objects do not slow it down."""
     asked: list[str] = []
     spool._connections.reading._db.set_trace_callback(asked.append)
     spool.reading.objects.held('clock')

@@ -1,4 +1,4 @@
-"""The list of what no part of the catalog has yet: nothing leaves it but with a part, and then once."""
+"""The list of objects that are not in the catalog yet: each leaves it with one catalog part, and only once."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def listed(root: Path) -> list[str]:
 
 
 def part(root: Path, name: str, *keys: str) -> DataObject:
-    """A part with rows of all that is listed, or of these."""
+    """A part with rows of everything listed, or of the given objects."""
     ids = tuple(item.id for item in uncataloged(root, ALL) if not keys or item.key in keys)
     return make(f'thor/_catalog/{name}.jsonl.zst', name.encode(), sensor='_catalog', topic=None, protected=True, catalogs=ids)
 
@@ -42,7 +42,7 @@ def delivered(spool: Spool, *keys: str) -> None:
 
 
 def test_delivered_objects_are_listed(spool: Spool, root: Path) -> None:
-    """Delivered objects are, the oldest first, with what they say of themselves; whatever else became of an object, it is not."""
+    """Delivered objects are listed, oldest first, with their metadata; objects with other outcomes are not."""
     items = put(spool, *(make(name, name.encode()) for name in 'abcd'))
     settle(spool, items[1], State.QUARANTINED, 'refused')
     settle(spool, items[2], State.EVICTED)
@@ -52,13 +52,13 @@ def test_delivered_objects_are_listed(spool: Spool, root: Path) -> None:
     assert listed(root) == ['a', 'd']
     (first, _) = uncataloged(root, ALL)
     assert first == (items[0].id, 'sensor-data', 'a', 1, 'image/jpeg', items[0].metadata, b'')
-    settle(spool, items[2], State.DELIVERED)  # it was on its way when it was evicted
+    settle(spool, items[2], State.DELIVERED)  # it was evicted during its upload
     assert listed(root) == ['a', 'c', 'd']
     assert [item.key for item in uncataloged(root, 2)] == ['a', 'c']
 
 
 def test_a_part_removes_its_rows_from_the_list(spool: Spool, root: Path) -> None:
-    """What it has rows of, and nothing else; the part itself is never listed."""
+    """Only the objects it has rows for; the part itself is never listed."""
     delivered(spool, 'a', 'b')
     (item,) = spool.commit([part(root, 'one', 'a')])
     assert listed(root) == ['b']
@@ -68,7 +68,7 @@ def test_a_part_removes_its_rows_from_the_list(spool: Spool, root: Path) -> None
 
 
 def test_a_row_is_in_one_part(spool: Spool, root: Path) -> None:
-    """Of two parts that have one of their rows in common, the second is left out as a whole, in the same commit or later."""
+    """If two parts share a row, the second is skipped completely, in the same commit or later."""
     delivered(spool, 'a', 'b')
     one, two = part(root, 'one'), part(root, 'two', 'a')
     assert [item.key for item in spool.commit([one, two, make('c', topic=None)])] == [one.key, 'c']
@@ -82,7 +82,7 @@ def refuse(_: Tree) -> None:
 
 
 def test_a_failed_commit_removes_nothing_from_the_list(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a full disk the rows stay listed, and the same part goes when there is room."""
+    """On a full disk the rows stay listed, and the same part is committed when there is room."""
     delivered(spool, 'a')
     made = part(root, 'one')
     with monkeypatch.context() as full:
@@ -94,9 +94,9 @@ def test_a_failed_commit_removes_nothing_from_the_list(spool: Spool, root: Path,
     assert listed(root) == []
 
 
-@pytest.mark.long('a death after each step')
+@pytest.mark.long('a kill after each step')
 def test_a_kill_at_any_moment_of_a_part_loses_no_row(root: Path, moments: Moments) -> None:
-    """After a kill every delivered object is listed, or in a part that is there to be delivered: never both, never neither."""
+    """After a kill every delivered object is either listed or in a part that is pending, never both or neither."""
     spool = new_spool(root)
     spool.open()
     items = put(spool, make('a', b'a'), make('b', b'b'))
@@ -126,7 +126,7 @@ def test_a_kill_at_any_moment_of_a_part_loses_no_row(root: Path, moments: Moment
 
 
 def test_listed_objects_are_not_forgotten(opened: Open, root: Path, clock: FakeClock) -> None:
-    """However old it is; once nobody wants its row, it is."""
+    """However old they are; once their rows are in a part, they are."""
     spool = opened()
     delivered(spool, 'a')
     clock.now_ns += 10**18
@@ -140,7 +140,7 @@ def test_listed_objects_are_not_forgotten(opened: Open, root: Path, clock: FakeC
 
 
 def test_an_object_has_the_columns_of_its_row(spool: Spool) -> None:
-    """Sensor, topic, type, count and times are in the metadata of each, but no time of a clock that is not set."""
+    """Sensor, topic, type, count and times are in the metadata of each, but no times of a clock that is not set."""
     (frame,) = put(spool, make('a', topic=None, type='', samples=0, sensor='missions', metadata={'robot': 'thor'}))
     assert {name: frame.metadata.get(name) for name in ('sensor', 'topic', 'count')} == {
         'sensor': 'missions', 'topic': None, 'count': None,

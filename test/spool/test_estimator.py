@@ -33,7 +33,7 @@ PERIOD = 20 * MS
 
 @dataclass
 class Ear:
-    """Drains a stream as the intake does: five times a second, all that was sent until then."""
+    """Drains a stream as the intake does: five times per second, everything sent until then."""
 
     estimator: LossEstimator = field(default_factory=LossEstimator)
     now_s: float = 0.0
@@ -44,7 +44,7 @@ class Ear:
     missed: Counter[str] = field(default_factory=Counter)
 
     def hear(self, stamps: Iterable[int], *, asleep_s: float = 0.0, shift: int = 0, **context: object) -> Ear:
-        """``asleep_s`` before the first drain; ``shift`` is what the publisher's clock is ahead of the stamps given here."""
+        """``asleep_s`` is the time before the first drain; ``shift`` is how far the publisher's clock is ahead of the stamps."""
         waiting = sorted(stamps)
         self.now_s += asleep_s
         while waiting:
@@ -75,7 +75,7 @@ def even(count: int, period: float = PERIOD, start: float = 0.0, jitter: float =
 
 
 def loop(count: int, period: float, jitter: float, seed: int) -> list[int]:
-    """A loop that sleeps: each interval has a jitter of its own."""
+    """A loop that sleeps: each interval has independent jitter."""
     chance = random.Random(seed)
     return [int(stamp) for stamp in accumulate(max(0.0, chance.gauss(period, jitter * period)) for _ in range(count))]
 
@@ -93,7 +93,7 @@ STREAMS = st.tuples(
 @settings(max_examples=examples(30), deadline=None)
 @given(STREAMS)
 def test_a_block_of_loss_is_known_to_5_percent(stream: tuple[int, float, bool, int, int, int, float]) -> None:
-    """With jitter up to 10 %, of a timer or of a loop, whatever the rate, and with single losses beside it."""
+    """With jitter up to 10 %, of a timer or of a loop, at any rate, and with single losses in addition."""
     period, jitter, is_loop, seed, start, length, rate = stream
     sent = loop(2000, period, jitter, seed) if is_loop else even(2000, period, 0.0, jitter, seed)
     chance = random.Random(seed)
@@ -107,7 +107,7 @@ def test_a_block_of_loss_is_known_to_5_percent(stream: tuple[int, float, bool, i
 @settings(max_examples=examples(30), deadline=None)
 @given(STREAMS)
 def test_nothing_is_called_lost_without_a_loss(stream: tuple[int, float, bool, int, int, int, float]) -> None:
-    """Jitter alone makes no loss: under one in a hundred, of loops that drift; none of a timer to speak of."""
+    """Jitter alone counts as a loss in less than one in a hundred streams of loops that drift, and in almost none of a timer."""
     period, jitter, is_loop, seed, *_ = stream
     ear = Ear().hear(loop(2000, period, jitter, seed) if is_loop else even(2000, period, 0.0, jitter, seed))
     assert ear.lost <= (20 if is_loop else 5)
@@ -130,7 +130,7 @@ def test_a_late_message_is_no_loss() -> None:
 
 
 def test_a_publisher_that_is_starved_and_catches_up_loses_nothing() -> None:
-    """What it sends at once, when it has its turn again, is what it could not send in time: a declared rate is not refuted."""
+    """What it sends in a burst, once it runs again, is what it could not send before: a declared rate is not refuted."""
     held = [max(stamp, (stamp // SECOND) * SECOND + 4 * SECOND // 10) for stamp in even(3000, jitter=0.0)]
     ear = Ear(LossEstimator(Expectation(period=PERIOD))).hear(held)
     assert (ear.covered, ear.estimator.refuted) == (3000, False)
@@ -138,14 +138,14 @@ def test_a_publisher_that_is_starved_and_catches_up_loses_nothing() -> None:
 
 
 def test_messages_overwritten_during_a_stall_are_lost_by_transport() -> None:
-    """What a full history overwrote meanwhile is lost by transport: nobody asked for it."""
+    """What a full history overwrote during the stall is lost by transport."""
     sent = even(1000)
     ear = Ear().hear(sent[:500]).hear(without(sent[500:], (10, 140)), asleep_s=3.0)
     assert ear.missed == {TRANSPORT: 130}
 
 
 def test_messages_delayed_during_a_stall_are_not_a_clock_step() -> None:
-    """It comes in several drains. The gap may be longer than the time between these, and is not a step of a clock."""
+    """They arrive in several drains. The gap may be longer than the time between drains, and is not a clock step."""
     sent = even(1000)
     ear = Ear().hear(sent[:500])
     held, later = sent[500:550], sent[650:]
@@ -158,7 +158,7 @@ def test_messages_delayed_during_a_stall_are_not_a_clock_step() -> None:
 
 @pytest.mark.parametrize('pause_s', [3, 60, 2000])
 def test_a_pause_is_marked(pause_s: int) -> None:
-    """Whether the publisher paused or the network was away, nobody knows: the cause says so."""
+    """Whether the publisher paused or the network was down is unknown: the cause records that."""
     sent = even(500)
     ear = Ear().hear([*sent, *(stamp + sent[-1] + pause_s * SECOND for stamp in sent)])
     assert ear.covered == ear.received
@@ -168,24 +168,24 @@ def test_a_pause_is_marked(pause_s: int) -> None:
 
 @pytest.mark.parametrize('factor', [0.5, 0.7, 1.5, 2.0, 4.0])
 def test_another_rate_is_no_loss(factor: float) -> None:
-    """It is learned anew, and what was counted until that showed is taken back."""
+    """It is learned again, and losses counted until the change was detected are taken back."""
     first = even(1000)
     ear = Ear().hear([*first, *even(1000, PERIOD / factor, first[-1] + PERIOD / factor)])
-    assert ear.covered >= ear.received - 1.5 * LEARN, 'what came while it was not known'
+    assert ear.covered >= ear.received - 1.5 * LEARN, 'messages during learning are not covered'
     assert ear.lost <= 20
     assert ear.estimator.period == pytest.approx(PERIOD / factor, rel=0.02)
 
 
 @pytest.mark.parametrize(('size', 'inner_ms', 'outer_ms'), [(4, 1, 50), (5, 1, 50), (5, 1, 2), (10, 0.2, 100), (100, 1, 1000)])
 def test_messages_in_groups_have_no_rhythm(size: int, inner_ms: float, outer_ms: float) -> None:
-    """The pauses between them are nobody's loss."""
+    """The pauses between them are not losses."""
     places = [group * (size * inner_ms + outer_ms) + each * inner_ms for group in range(3000 // size) for each in range(size)]
     ear = Ear().hear(int(place * MS) for place in places)
     assert (ear.covered, ear.lost) == (0, 0)
 
 
 def test_random_messages_have_no_rhythm() -> None:
-    """Intervals of no length in particular."""
+    """Intervals of random length."""
     chance = random.Random(3)
     ear = Ear().hear(int(stamp) for stamp in accumulate(chance.expovariate(1 / PERIOD) for _ in range(3000)))
     assert (ear.covered, ear.lost) == (0, 0)
@@ -193,7 +193,7 @@ def test_random_messages_have_no_rhythm() -> None:
 
 @pytest.mark.parametrize('phase', [0.1, 0.3, 0.45])
 def test_two_publishers_have_no_rhythm(phase: float) -> None:
-    """Interleaved they break the one there was, and none is learned of them."""
+    """Interleaved, they break the existing rhythm, and no new one is learned from them."""
     first = even(2000)
     ear = Ear().hear(first[:500])
     assert ear.covered == 500
@@ -204,14 +204,14 @@ def test_two_publishers_have_no_rhythm(phase: float) -> None:
 
 
 def test_two_alternating_publishers_are_not_mistaken_for_one() -> None:
-    """They look like one of twice the rate; the graph says that they are two."""
+    """They look like one of twice the rate; the ROS graph shows that there are two."""
     ear = Ear().hear(even(2000), is_only=False)
     assert (ear.covered, ear.lost) == (0, 0)
 
 
 @pytest.mark.parametrize('step_s', [-3600, -5, 5, 3600])
 def test_a_step_of_a_clock_is_no_loss(step_s: int) -> None:
-    """In either direction: no more can be lost than was sent in the time that passed."""
+    """In either direction: no more can be lost than was sent in the elapsed time."""
     first = even(500)
     ear = Ear().hear(first).hear(even(500, start=first[-1] + PERIOD), shift=step_s * SECOND)
     assert ear.covered == ear.received
@@ -220,7 +220,7 @@ def test_a_step_of_a_clock_is_no_loss(step_s: int) -> None:
 
 @pytest.mark.parametrize('drift', [-0.0005, 0.0005])
 def test_a_drifting_clock_is_followed(drift: float) -> None:
-    """A step is still told from loss after hours, in which the clocks have gone apart by more than that."""
+    """A step is still distinguished from a loss after hours, when the clocks have drifted apart by more than that."""
     estimator = LossEstimator(Expectation(period=10 * SECOND))
     for second in range(0, 15_000, 10):
         estimator.observe([int(second * (1 + drift) * SECOND)], ArrivalContext(second))
@@ -229,14 +229,14 @@ def test_a_drifting_clock_is_followed(drift: float) -> None:
 
 
 def test_a_small_step_forward_looks_like_loss() -> None:
-    """That much is said in docs/formats.md."""
+    """docs/formats.md documents this limit."""
     first = even(500)
     ear = Ear().hear(first).hear(even(500, start=first[-1] + PERIOD), shift=SECOND // 2)
     assert ear.lost == 25
 
 
 def test_overtaken_messages_fill_their_gap() -> None:
-    """What comes late, out of order, was not lost."""
+    """A message that arrives late, out of order, was not lost."""
     estimator = LossEstimator(Expectation(period=PERIOD))
     missed: Counter[str] = Counter()
     for places in ([0, 1, 4], [2, 3, 5, 6]):
@@ -245,14 +245,14 @@ def test_overtaken_messages_fill_their_gap() -> None:
 
 
 def test_a_declared_rate_detects_even_loss() -> None:
-    """Which nothing else can: three of four messages are lost from the start."""
+    """Nothing else can detect it: three of four messages are lost from the start."""
     sent = even(2000)
     assert Ear().hear(sent[::4]).lost == 0
     assert Ear(LossEstimator(Expectation(period=PERIOD))).hear(sent[::4]).lost == 1497
 
 
 def test_a_wrong_declared_rate_is_detected() -> None:
-    """When messages come more often it is not believed any more."""
+    """When messages arrive more often it is ignored."""
     ear = Ear(LossEstimator(Expectation(period=2.5 * PERIOD))).hear(even(1000))
     assert ear.estimator.refuted
     assert (ear.lost, ear.estimator.period) == (0, pytest.approx(PERIOD, rel=0.02))
@@ -264,7 +264,7 @@ def test_a_wrong_declared_rate_is_detected() -> None:
     st.integers(1, 500),
 )  # fmt: skip
 def test_a_counter_counts_exactly(first: int, step: int, wrap: int, start: int, length: int) -> None:
-    """Wherever it begins anew, and also where its step is to be learned."""
+    """From any start, and also if its step must be learned."""
     for declared in (float(step), 0.0):
         estimator = LossEstimator(Expectation('counter:tick', declared, wrap))
         values = [(first + place * step) % wrap for place in without(range(1500), (start, start + length))]
@@ -275,13 +275,13 @@ def test_a_counter_counts_exactly(first: int, step: int, wrap: int, start: int, 
 
 
 def test_a_counter_that_stays_zero_is_not_used() -> None:
-    """It says nothing, and nothing is claimed."""
+    """No loss is reported from it."""
     estimator = LossEstimator(Expectation('counter:tick', 0.0, 1 << 32))
     assert sum(estimator.observe([0] * 10, ArrivalContext()).covered for _ in range(100)) == 0
 
 
 def test_a_restarted_counter_is_not_a_loss() -> None:
-    """A robot that was started again counts from 0."""
+    """A robot that was restarted counts from 0."""
     estimator = LossEstimator(Expectation('counter:tick', 2.0, 1 << 32))
     missed: Counter[str] = Counter()
     for values in (range(1000, 1100, 2), range(0, 100, 2)):
@@ -290,14 +290,14 @@ def test_a_restarted_counter_is_not_a_loss() -> None:
 
 
 def test_a_gap_before_another_publisher_is_no_loss() -> None:
-    """Its predecessor may have left at any time; one gap later it is a publisher like any other."""
+    """Its predecessor may have left at any time; after one gap it is treated as any other publisher."""
     sent = even(1000)
     ear = Ear().hear(sent[:400]).hear(sent[500:501], has_new=True).hear(without(sent[501:], (100, 130)))
     assert ear.missed == {TRANSPORT: 30}
 
 
 def test_one_of_many_publishers_is_not_counted() -> None:
-    """While several publish, and nobody knows who, nothing is claimed; with the last one the rhythm goes on."""
+    """While several publish, the sender of a message is unknown and nothing is claimed; with one left the rhythm continues."""
     estimate = TopicEstimate()
     sent = even(1000, jitter=0.0)
     alone, crowd = ArrivalContext(gid='a'), ArrivalContext(is_only=False, is_shared=True)
@@ -310,7 +310,7 @@ def test_one_of_many_publishers_is_not_counted() -> None:
 
 
 def test_each_publisher_has_its_own_rate() -> None:
-    """Whatever their rates, and whether the graph knows several."""
+    """Whatever their rates, and whether or not the graph shows several."""
     estimate = TopicEstimate()
     context = ArrivalContext(is_only=False, is_shared=True)
     stamps = {'p': without(even(500), (300, 320)), 'q': even(300, 3 * PERIOD)}
@@ -319,7 +319,7 @@ def test_each_publisher_has_its_own_rate() -> None:
 
 
 def test_the_next_session_continues() -> None:
-    """With the rhythm and the last stamp: what was sent meanwhile was missed by the restart."""
+    """With the rhythm and the last stamp: what was sent in between was missed by the restart."""
     before = TopicEstimate()
     sent = even(600)
     before.observe({'': sent[:300]}, ArrivalContext(gid='a'))
@@ -331,5 +331,5 @@ def test_the_next_session_continues() -> None:
 
 @given(st.lists(st.integers(-(10**9), 10**9), min_size=2, max_size=300))
 def test_any_intervals_are_accepted(intervals: list[int]) -> None:
-    """Whatever they are, there is a period or none."""
+    """For any intervals there is a period or none."""
     assert learn_period(intervals) >= 0.0

@@ -25,13 +25,13 @@ from shadowhound_data_logger.spool.writer import SpoolWriter
 
 MS = SECOND // 1000
 LATE_NS = 146 * SECOND
-"""How much later than their stamps these messages arrive."""
+"""The delay between the stamp and the arrival of these messages."""
 DAY_NS = 24 * 3600 * SECOND
 CAMERA = '/camera'
 
 
 def journal(root: Path) -> list[Gap]:
-    """All of it, read by somebody else."""
+    """The whole journal, read over a separate connection."""
     with closing(sqlite3.connect(root / 'index.db')) as db:
         return GapTable(lambda: db).known({})
 
@@ -45,14 +45,14 @@ def short(root: Path) -> list[tuple[str, str, int | None, float | None, float | 
 
 
 def tell(root: Path) -> None:
-    """As after a part that tells all."""
+    """Mark everything as reported, as a part with all gaps does."""
     with closing(Index(root / 'index.db')) as index:
         index.open()
         index.catalog.clear()
 
 
 def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA, period_ns: int = 100 * MS) -> None:
-    """Take the messages with these numbers, sent at noon and a period later for each."""
+    """Take the messages with these numbers, sent at noon and then one per period."""
     with spool.accounts.entry(topic) as account:
         for number in numbers:
             times = Times(NOON_NS + number * period_ns, NOON_NS + number * period_ns + LATE_NS)
@@ -64,7 +64,7 @@ def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA,
 
 
 def test_a_gap_has_the_times_of_its_neighbors(spool: Spool, root: Path) -> None:
-    """From the stamp of the last message before to that of the first after, of its publisher, in its mission."""
+    """From the stamp of the last message before it to that of the first one after, of its publisher, in its mission."""
     hear(spool, 1, 2)
     spool.commit()
     spool.accounts.set_mission('patrol-7')
@@ -80,7 +80,7 @@ def test_a_gap_has_the_times_of_its_neighbors(spool: Spool, root: Path) -> None:
 
 
 def test_gaps_merge_within_a_second(spool: Spool, root: Path) -> None:
-    """A topic that loses every other message is a row a second, in however many commits."""
+    """A topic that loses every other message adds one row per second, over any number of commits."""
     for number in range(0, 600, 2):
         hear(spool, number, period_ns=10 * MS)
         if number % 50 == 0:
@@ -94,7 +94,7 @@ def test_gaps_merge_within_a_second(spool: Spool, root: Path) -> None:
 
 @pytest.mark.parametrize('commit', [True, False], ids=['committed', 'not yet'])
 def test_a_late_number_takes_its_loss_out_of_the_journal(spool: Spool, root: Path, commit: bool) -> None:
-    """In the commit that has it as received; with the last one the row says nothing any more."""
+    """In the commit that counts it as received; with the last one the row becomes zero."""
     hear(spool, 1, 5)
     if commit:
         spool.commit()
@@ -108,7 +108,7 @@ def test_a_late_number_takes_its_loss_out_of_the_journal(spool: Spool, root: Pat
 
 
 def test_a_copy_of_the_journal_sees_every_change(spool: Spool, root: Path) -> None:
-    """By version: new rows, changed ones, and those that say nothing any more."""
+    """By version: new rows, changed ones, and those that became zero."""
     hear(spool, 1, 5)
     spool.commit()
     (first,), _ = spool.gaps_after(0, 10, {})
@@ -121,7 +121,7 @@ def test_a_copy_of_the_journal_sees_every_change(spool: Spool, root: Path) -> No
 
 
 def test_the_watermark_is_before_open_batches(spool: Spool) -> None:
-    """While a message has no outcome yet, or is not delivered, it may still be lost; the journal is complete up to it."""
+    """A message without an outcome or not delivered may still be lost; the journal is complete up to the watermark."""
     hear(spool, 1)
     (item,) = spool.commit([make('a')])
     assert spool.gaps_after(0, 10, {})[1] == []
@@ -138,7 +138,7 @@ def test_the_watermark_is_before_open_batches(spool: Spool) -> None:
 
 
 def test_a_recently_received_publisher_holds_the_watermark(spool: Spool) -> None:
-    """What it sent since may be found to be missed; after a minute nobody waits for it."""
+    """Messages it sent since may turn out to be missed; after a minute the watermark stops waiting for it."""
     hear(spool, 10, publisher='slow')
     for number, ends_s in ((100, 1), (580, 1), (700, 70)):
         hear(spool, number)
@@ -159,7 +159,7 @@ def watermark(spool: Spool) -> tuple[float, float]:
 
 
 def test_a_stamp_of_the_future_moves_no_watermark_beyond_now(spool: Spool) -> None:
-    """Whoever publishes may stamp as it likes: it vouches for no time to come, in this session or later."""
+    """A publisher may use any stamp: it moves no watermark into the future, in this session or later."""
     hear(spool, 1, 2)
     with spool.accounts.entry(CAMERA) as account:
         account.receive('hostile', 1, by_arrival(NOON_NS + 365 * 24 * 3600 * SECOND))
@@ -172,7 +172,7 @@ def test_a_stamp_of_the_future_moves_no_watermark_beyond_now(spool: Spool) -> No
 
 
 def test_a_stamp_of_the_future_is_the_time_of_no_loss() -> None:
-    """More than a day ahead of our clock nobody believes it: the other end of the gap counts, or nothing."""
+    """A stamp more than a day ahead of our clock is ignored: the other end of the gap counts, or nothing."""
     found = TopicGaps(clock=FakeClock())
     later_ns = NOON_NS + 25 * 3600 * SECOND
     assert found.add('missed', 'transport', 2, by_arrival(NOON_NS), by_arrival(later_ns)).begin_ns == NOON_NS
@@ -181,7 +181,7 @@ def test_a_stamp_of_the_future_is_the_time_of_no_loss() -> None:
 
 
 def test_a_loss_is_timed_by_one_clock() -> None:
-    """One publisher with UTC and one with a clock that was never set: no gap is from the one to the other."""
+    """One publisher with UTC and one with a clock that was never set: no gap spans the two clocks."""
     found = TopicGaps(clock=FakeClock(now_ns=50 * SECOND))
     key = found.add('missed', 'transport', 2, by_arrival(NOON_NS), by_arrival(40 * SECOND))
     ((row,), _) = found.settle(CAMERA, {key[:3]: 2})
@@ -189,7 +189,7 @@ def test_a_loss_is_timed_by_one_clock() -> None:
 
 
 def test_a_restart_with_a_publisher_ahead_is_timed_by_its_clock(root: Path) -> None:
-    """An hour ahead: the messages that the restart cost, and the watermark, have stamps after now."""
+    """An hour ahead: the messages lost by the restart, and the watermark, have stamps in the future."""
     clock = FakeClock()
     spool = new_spool(root, clock)
     spool.open()
@@ -220,7 +220,7 @@ def put_newest(spool: Spool, times: Times, key: str) -> list[SpooledObject]:
 
 
 def test_a_loss_of_unknown_publishers_is_not_from_one_clock_to_the_other() -> None:
-    """Two publishers with clocks five minutes apart: the loss is as long as it took, by the clock of the message after it."""
+    """Two publishers with clocks five minutes apart: the loss has its true length, by the clock of the message after it."""
     found = TopicGaps(clock=FakeClock(now_ns=NOON_NS + 10 * SECOND))
     right, behind = Times(NOON_NS, NOON_NS), Times(NOON_NS - 298 * SECOND, NOON_NS + 2 * SECOND)
     found.add('dropped', 'restart', 10, right, behind)
@@ -232,7 +232,7 @@ def test_a_loss_of_unknown_publishers_is_not_from_one_clock_to_the_other() -> No
 
 
 def test_the_watermark_follows_a_clock_that_is_set_back(spool: Spool) -> None:
-    """What was complete by the wrong clock says nothing of the same time by the right one."""
+    """What was complete by the wrong clock is no evidence about the same time by the correct one."""
     hear(spool, 100)
     deliver(spool, *spool.commit([make('a')]))
     clock = spool._clock
@@ -246,7 +246,7 @@ def test_the_watermark_follows_a_clock_that_is_set_back(spool: Spool) -> None:
 
 
 def test_the_watermark_begins_with_the_first_message_of_the_session(root: Path, opened: Open) -> None:
-    """Who began to publish before a node listened has sent messages that nobody counts."""
+    """Messages sent before a node subscribed are not counted by any session."""
     spool = opened()
     hear(spool, 10)
     deliver(spool, *spool.commit([make('a')]))
@@ -264,7 +264,7 @@ def test_the_watermark_begins_with_the_first_message_of_the_session(root: Path, 
 
 
 def test_the_watermark_waits_for_publishers_of_the_session_before(root: Path, opened: Open) -> None:
-    """One of two is discovered later: what it sent meanwhile is missed by the restart, which nobody knows before."""
+    """One of two is discovered later: what it sent in between is missed by the restart, which is unknown until then."""
     spool = opened()
     hear(spool, 10)
     hear(spool, 10, publisher='q')
@@ -281,7 +281,7 @@ def test_the_watermark_waits_for_publishers_of_the_session_before(root: Path, op
 
 
 def test_a_batch_does_not_advance_the_watermark_past_an_earlier_one(root: Path, opened: Open) -> None:
-    """Two encoders: the later batch is durable, a death takes the earlier one; its time is not known to be complete."""
+    """Two encoders: the later batch is durable, a kill loses the earlier one; its time is not known to be complete."""
     spool = new_spool(root)
     spool.open()
     hear(spool, 1)
@@ -296,7 +296,7 @@ def test_a_batch_does_not_advance_the_watermark_past_an_earlier_one(root: Path, 
 
 
 def test_a_retried_commit_claims_no_later_messages(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has the objects that it had before; one that was made since then is only in memory."""
+    """It has the same objects as before; one that was created since then is only in memory."""
     spool.accounts.oldest_open = dict
     hear(spool, 1)
     items = spool.commit([make('a')])
@@ -310,7 +310,7 @@ def test_a_retried_commit_claims_no_later_messages(spool: Spool, monkeypatch: py
 
 
 def test_objects_waiting_for_a_full_disk_are_not_settled(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Outcomes are committed first, without the objects that have no room yet."""
+    """Outcomes are committed first, without the objects that do not fit yet."""
     spool.accounts.oldest_open = dict
     hear(spool, 1)
     items = spool.commit([make('a')])
@@ -329,7 +329,7 @@ def test_objects_waiting_for_a_full_disk_are_not_settled(spool: Spool, monkeypat
 
 
 def test_the_losses_of_a_kill_are_listed(root: Path, opened: Open) -> None:
-    """Open batches: dropped, between what was durable and what was heard; what nobody heard: missed, until it was."""
+    """Open batches: dropped, between what was durable and what was received; after that: missed, until the next message."""
     spool = new_spool(root)
     spool.open()
     hear(spool, 10)
@@ -345,7 +345,7 @@ def test_the_losses_of_a_kill_are_listed(root: Path, opened: Open) -> None:
 
 
 def test_estimated_losses_of_a_restart_have_times(root: Path) -> None:
-    """From the newest message of the session before; where numbers tell, but not who sent the last one when, as well."""
+    """From the newest message of the previous session; also if there are numbers, but the stamp of the last one is unknown."""
     spool = new_spool(root)
     spool.open()
     hear(spool, 10)
@@ -364,14 +364,14 @@ def test_estimated_losses_of_a_restart_have_times(root: Path) -> None:
 
 
 def test_messages_of_another_type_have_their_time(spool: Spool, root: Path) -> None:
-    """Though none of the topic's own came."""
+    """Even if the topic's own type was never received."""
     spool.accounts.reject_other_type(CAMERA, 'x/msg/Y', 3, by_arrival(NOON_NS), by_arrival(NOON_NS + SECOND))
     spool.commit()
     assert short(root) == [('rejected', 'wrong_type', 3, 0.0, 1.0)]
 
 
 def test_an_object_is_in_the_journal_while_it_is_quarantined(spool: Spool, root: Path) -> None:
-    """A retry takes its messages out again; of an object of several topics those of each."""
+    """A retry removes its messages again; an object of several topics adds those of each."""
     with spool.accounts.entry(CAMERA) as account:
         account.receive('p', 1)
     with spool.accounts.entry(f'{BAG}/imu') as account:
@@ -389,7 +389,7 @@ def test_an_object_is_in_the_journal_while_it_is_quarantined(spool: Spool, root:
 
 
 def test_an_object_without_room_is_in_the_journal(root: Path) -> None:
-    """With the times of its messages, whether it was in the spool before or never got in."""
+    """With the times of its messages, whether it was evicted from the spool or never added."""
     spool = new_spool(root, max_bytes=20_000)
     spool.open()
     put(spool, make('a', b'1' * 9_000, t_start_ns=NOON_NS + SECOND, t_end_ns=NOON_NS + 3 * SECOND))
@@ -402,7 +402,7 @@ def test_an_object_without_room_is_in_the_journal(root: Path) -> None:
 
 
 def test_forgotten_gaps_stay_in_the_sums(root: Path) -> None:
-    """Rows go with the keys that are remembered no longer, and the ledger still closes."""
+    """Rows are removed with the keys that expire, and the ledger still balances."""
     clock = FakeClock()
     spool = new_spool(root, clock)
     spool.open()
@@ -410,7 +410,7 @@ def test_forgotten_gaps_stay_in_the_sums(root: Path) -> None:
     spool.commit()
     clock.now_ns += 1000 * DAY_NS
     spool.commit()
-    assert len(short(root)) == 3, 'nobody was told yet'
+    assert len(short(root)) == 3, 'not reported yet'
     tell(root)
     clock.now_ns += DAY_NS
     spool.commit()
@@ -422,9 +422,9 @@ def test_forgotten_gaps_stay_in_the_sums(root: Path) -> None:
     spool.close()
 
 
-@pytest.mark.parametrize('counts', [{}, {CAMERA: 1}], ids=['of one topic', 'of several'])
+@pytest.mark.parametrize('counts', [{}, {CAMERA: 1}], ids=['only one topic', 'of several'])
 def test_an_object_evicted_during_its_upload_that_arrived_is_not_a_loss(root: Path, counts: dict[str, int]) -> None:
-    """Its row is forgotten early, since its messages are that old; the sum is put right all the same."""
+    """Its row is forgotten early, since its messages are that old; the total is corrected anyway."""
     clock = FakeClock()
     spool = new_spool(root, clock)
     spool.open()
@@ -443,14 +443,14 @@ def test_an_object_evicted_during_its_upload_that_arrived_is_not_a_loss(root: Pa
 
 
 class BootedAtNoon(FakeClock):
-    """Its boot clock is none of UTC."""
+    """A boot clock unrelated to UTC."""
 
     def boot_ns(self) -> int:
         return self.now_ns - NOON_NS
 
 
 def test_rows_of_an_hour_are_bounded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Publishers that come and go, with stamps of any time: further gaps of a cause share a row, and each message is counted."""
+    """Publishers that start and stop, with any stamps: further gaps of a cause share a row, and each message is counted."""
     monkeypatch.setattr(gaps, 'MAX_NEW_ROWS', 20)
     clock = BootedAtNoon(NOON_NS + 1800 * SECOND)
     spool = new_spool(root, clock)
@@ -469,23 +469,23 @@ def test_rows_of_an_hour_are_bounded(root: Path, monkeypatch: pytest.MonkeyPatch
     assert len(rows) == 20 + 2
     assert sum(row.count or 0 for row in rows) == lost
     (shared,) = [row for row in rows if row.publisher is None and row.from_ns is not None]
-    assert shared.from_ns == NOON_NS - 299 * DAY_NS, 'it reaches from the first one to the last one'
-    assert shared.begin_ns == NOON_NS, 'and is of the hour in which they were found'
+    assert shared.from_ns == NOON_NS - 299 * DAY_NS, 'the row spans the first to the last one'
+    assert shared.begin_ns == NOON_NS, 'and belongs to the hour in which they were found'
     with spool.accounts.entry(CAMERA) as account:
         assert account.receive('p299', 3, by_arrival(NOON_NS))
     spool.commit()
-    assert sum(row.count or 0 for row in journal(root)) == lost - 1, 'a late message is taken out of it'
+    assert sum(row.count or 0 for row in journal(root)) == lost - 1, 'a late message is subtracted from it'
     assert ledger.read(root, 'thor')['balanced']
     clock.now_ns += 3600 * SECOND
     with spool.accounts.entry(CAMERA) as account:
         account.receive('p299', 50, by_arrival(clock.now_ns))
     spool.commit()
-    assert 'p299' in {row.publisher for row in journal(root)}, 'the next hour has rows of its own again'
+    assert 'p299' in {row.publisher for row in journal(root)}, 'the next hour has separate rows again'
     spool.close()
 
 
 def test_a_gap_is_kept_until_it_is_reported(root: Path) -> None:
-    """Of a robot that was off for longer than rows are kept it began too long ago already. One that just ended stays as well."""
+    """A robot that was off for longer than rows are kept has a gap with an old start. One that just ended is kept as well."""
     clock = FakeClock()
     spool = new_spool(root, clock)
     spool.open()
@@ -503,7 +503,7 @@ def test_a_gap_is_kept_until_it_is_reported(root: Path) -> None:
     tell(root)
     clock.now_ns += DAY_NS
     spool.commit()
-    assert [gap.from_ns for gap in journal(root)] == [NOON_NS + 100 * MS], 'it ended a day ago'
+    assert [gap.from_ns for gap in journal(root)] == [NOON_NS + 100 * MS], 'the gap ended a day ago'
     clock.now_ns += 2 * DAY_NS
     spool.commit()
     assert short(root) == [('missed', 'restart', 7, None, None)]
@@ -511,7 +511,7 @@ def test_a_gap_is_kept_until_it_is_reported(root: Path) -> None:
 
 
 def test_rows_without_a_time_are_removed_with_their_session(root: Path) -> None:
-    """Of before the clock was set, of no time and of a time to come: they cannot be told by their age."""
+    """Rows from before the clock was set, without a time, or with a future time: their age is unknown."""
     clock = FakeClock(now_ns=500 * SECOND)
     spool = new_spool(root, clock)
     spool.open()
@@ -536,7 +536,7 @@ def test_rows_without_a_time_are_removed_with_their_session(root: Path) -> None:
 
 
 def test_the_number_of_rows_is_limited(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Told or not, and where no clock is ever set: those that did not change for the longest become a sum."""
+    """Reported or not, also if no clock is ever set: those unchanged for the longest time are merged into a total."""
     monkeypatch.setattr(gap_table, 'MAX_ROWS', 10)
     clock.now_ns = 500 * SECOND
     for number in range(30):
@@ -556,7 +556,7 @@ def test_the_number_of_rows_is_limited(spool: Spool, root: Path, clock: FakeCloc
 
 
 def test_before_the_clock_is_set_losses_have_times_since_boot() -> None:
-    """A publisher on this machine stamps by the same wrong clock; an offset that is known later dates them."""
+    """A publisher on this machine stamps with the same wrong clock; an offset that becomes known later dates its messages."""
     clock = FakeClock(now_ns=5 * SECOND)
     found = TopicGaps(clock=clock)
     key = found.add('missed', 'transport', 2, by_arrival(3 * SECOND), by_arrival(4 * SECOND))
@@ -564,7 +564,7 @@ def test_before_the_clock_is_set_losses_have_times_since_boot() -> None:
 
 
 def test_a_failed_commit_keeps_the_times(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next one has what it had, once."""
+    """The next one contains the same data, once."""
     hear(spool, 1, 3)
     spool.commit()
     hear(spool, 6)
@@ -598,7 +598,7 @@ STEPS = st.lists(
 def test_the_journal_adds_up_at_every_commit(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]], bounds: tuple[int, int]
 ) -> None:
-    """Whatever comes late, fails, dies, is evicted, quarantined, tried again, forgotten, or too much for rows of its own."""
+    """With late messages, failures, kills, evictions, quarantine, retries, forgotten rows, and more gaps than rows."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gaps, 'MAX_NEW_ROWS', bounds[0])
         patch.setattr(gap_table, 'MAX_ROWS', bounds[1])
@@ -689,7 +689,7 @@ def _run(root: Path, query: str, number: int) -> None:
 
 
 def test_a_home_with_losses_reads_in_the_order_of_time(spool: Spool, root: Path) -> None:
-    """Of all sinks and topics."""
+    """For all sinks and topics."""
     hear(spool, 20, 30, topic='/b')
     hear(spool, 1, 9, topic=f'{BAG}/a')
     spool.commit()

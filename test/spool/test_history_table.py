@@ -24,14 +24,14 @@ FACTS = {'pose': '3.214 -1.502 0.7854 odom', 'battery_pct': '81.0', 'mission_id'
 
 
 def frame(second: int, **fields: object) -> DataObject:
-    """An object as a node in a mission makes them, of a second of the day."""
+    """An object as a node creates it during a mission, at this second of the day."""
     key = f'thor/camera/20251018/{second // 3600:02}{second // 60 % 60:02}{second % 60:02}_front.jpg'
     times = {'t_start_ns': str(NOON_NS + second * SECOND), 't_end_ns': str(NOON_NS + second * SECOND)}
     return make(key, f'frame {second}'.encode(), **{'metadata': {'robot': 'thor', **times, **FACTS}, **fields})
 
 
 def leave(spool: Spool, *objects: DataObject, state: State = State.DELIVERED) -> None:
-    """Spool them, and have them leave; the catalog has their rows."""
+    """Spool them and give them their final outcome; the catalog has their rows."""
     items = put(spool, *objects)
     spool.commit(outcomes=[Outcome(item, state, 'no_room' if state is State.EVICTED else None) for item in items])
     catalog(spool)
@@ -44,7 +44,7 @@ def catalog(spool: Spool) -> None:
 
 
 def age(spool: Spool, by_ns: int = 2 * HOUR_NS) -> None:
-    """Let time pass, and commit until everything is forgotten that is due."""
+    """Let time pass, and commit until everything that has expired is removed."""
     clock = spool._clock
     assert isinstance(clock, FakeClock)
     clock.now_ns += by_ns
@@ -60,7 +60,7 @@ def used(root: Path) -> tuple[int, int]:
 
 
 def test_free_pages_are_reused(spool: Spool, root: Path) -> None:
-    """The file does not grow once as much is forgotten as comes."""
+    """The file stops growing once as many rows are forgotten as added."""
     sizes = []
     for day in range(10):
         leave(spool, *(replace(frame(second), key=f'thor/camera/{day}/{second}') for second in range(300)))
@@ -70,7 +70,7 @@ def test_free_pages_are_reused(spool: Spool, root: Path) -> None:
 
 
 def test_keys_stay_known_as_long_as_they_are_needed(opened: Open, spool: Spool, root: Path) -> None:
-    """That it was used, with which content; what became of it; and the ledger."""
+    """That the key was used, and for which content; the outcome; and the ledger."""
     leave(spool, frame(1), make('thor/rosbags/bag_a/bag_a_0.mcap', b'a slice'))
     leave(spool, make('thor/rosbags/bag_a/bag_a_1.mcap', b'another'), state=State.EVICTED)
     before = assert_whole(root)
@@ -86,13 +86,13 @@ def test_keys_stay_known_as_long_as_they_are_needed(opened: Open, spool: Spool, 
         'thor/rosbags/bag_a/bag_a_0.mcap': State.DELIVERED, 'thor/rosbags/bag_a/bag_a_1.mcap': State.EVICTED,
     }  # fmt: skip
     (again,) = put(spool, replace(frame(1), body=b'other'))
-    assert again.key == key.replace('.jpg', '_1.jpg'), 'a name is given out once'
+    assert again.key == key.replace('.jpg', '_1.jpg'), 'a name is used once'
     spool.commit(outcomes=[Outcome(again, State.DELIVERED)])
     path = root / 'ready' / BUCKET / key
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(frame(1).body if isinstance(frame(1).body, bytes) else b'')
     spool.close()
-    assert opened().recovery.counts['delivered files removed'] == 1, 'a file that came back is known by its content'
+    assert opened().recovery.counts['delivered files removed'] == 1, 'a file that reappeared is recognized by its content'
     assert not os.path.lexists(path)
 
 
@@ -109,7 +109,7 @@ def test_an_audit_checks_each_delivery_once(spool: Spool, root: Path) -> None:
 
 
 def test_uncataloged_objects_keep_their_rows(spool: Spool, root: Path) -> None:
-    """Its metadata are what a part of the catalog is made of."""
+    """A catalog part is built from their metadata."""
     (item,) = put(spool, frame(1))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
     age(spool, 30 * DAY_NS)
@@ -120,7 +120,7 @@ def test_uncataloged_objects_keep_their_rows(spool: Spool, root: Path) -> None:
 
 
 def test_objects_refused_by_a_full_disk_are_forgotten_too(root: Path) -> None:
-    """It has the time at which it came."""
+    """It records the time of the refusal."""
     clock = FakeClock()
     spool = new_spool(root, clock, max_bytes=1)
     spool.open()

@@ -1,4 +1,4 @@
-"""The index: the cost of a look at a long backlog, and recordings."""
+"""The index: the cost of a query over a long backlog, and recordings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEP = 20
 
 @pytest.fixture
 def index(tmp_path: Path) -> Iterator[Index]:
-    """An index, empty."""
+    """An empty index."""
     opened = Index(tmp_path / 'index.db')
     opened.open()
     yield opened
@@ -39,7 +39,7 @@ def add(index: Index, numbers: range, bucket: str) -> None:
 
 
 def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:
-    """Steps of SQLite's machine for one look: what it costs, whatever else the computer does."""
+    """SQLite virtual machine steps of one query: its cost, independent of the load of the computer."""
     steps = 0
 
     def count() -> int:
@@ -56,7 +56,7 @@ def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:
 
 @pytest.mark.long('a second of CPU or more')
 def test_a_query_costs_the_same_whatever_the_backlog(index: Index) -> None:
-    """In both orders, also while the bucket of the backlog takes nothing."""
+    """In both orders, also while the bucket of the backlog accepts nothing."""
     add(index, range(20), 'b')
     add(index, range(FEW), 'a')
     ways = [{'oldest': oldest, 'without': without} for oldest in (False, True) for without in ((), ('a',))]
@@ -68,7 +68,7 @@ def test_a_query_costs_the_same_whatever_the_backlog(index: Index) -> None:
 
 @pytest.mark.parametrize('oldest', [False, True])
 def test_the_order_holds_across_buckets(index: Index, oldest: bool) -> None:
-    """Objects of several buckets come as if they were in one."""
+    """Objects of several buckets are ordered as if they were in one."""
     for place in range(30):
         add(index, range(place, place + 1), 'abc'[place % 3])
     found = [(row['priority'], row['id']) for row in index.objects.pending(20, oldest=oldest, without=('c',))]
@@ -82,7 +82,7 @@ MISSING = MissingRow(0, 'b_0.mcap', 'why', None, None, None)
 
 
 def test_recordings_are_kept_by_owner(root: Path) -> None:
-    """What is told twice is there once; the end of one bag leaves the others, of this owner and of another, as they are."""
+    """A duplicate is stored once; the end of one bag does not affect other bags, of this owner or of another."""
     node, by_hand = (Spool(root, SpoolSettings(min_free_bytes=0), FakeClock(), owner) for owner in ('thor', 'thor records'))
     node.open()
     by_hand.open()
@@ -99,7 +99,7 @@ def test_recordings_are_kept_by_owner(root: Path) -> None:
 
 
 def test_a_slice_and_its_row_are_one_transaction(opened: Open, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the one cannot be written, the other is not there either."""
+    """If one cannot be written, the other is not written either."""
     spool = opened()
     with monkeypatch.context() as patch:
         patch.setattr(RecordingTable, 'write', Mock(side_effect=sqlite3.OperationalError('disk I/O error')))

@@ -1,4 +1,4 @@
-"""A large index is checked while it is in use: the start does not wait, and what is damaged is rebuilt at the next one."""
+"""A large index is checked while it is in use: startup does not wait, and a damaged index is rebuilt at the next start."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shadowhound_data_logger.spool.index_check import IndexCheck
 
 @pytest.fixture
 def large(request: pytest.FixtureRequest, used: dict[str, bytes], root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A closed spool whose index counts as large; its parameter is how many rows it has."""
+    """A closed spool with an index that counts as large; the parameter is its number of rows."""
     fill(root, getattr(request, 'param', 2000))
     monkeypatch.setattr(recovery, 'CHECKED_FIRST_BYTES', 0)
     return root
@@ -75,7 +75,7 @@ def test_a_damaged_row_in_the_spool_is_found_before_it_is_used(large: Path, open
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('large', [300_000], indirect=True)
 def test_a_stop_does_not_wait_for_the_check(large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ends a running check, which is not a sign of damage."""
+    """It ends a running check, which does not count as damage."""
     running = threading.Event()
     full = Index.check
 

@@ -20,7 +20,7 @@ LATE = StampReport('p', 'offset', 146.0, 0.1, 1, 'clock')
 
 
 def run_sql(root: Path, *statements: str) -> None:
-    """What a bug or a bad disk would do."""
+    """Change the index as a bug or a bad disk would."""
     connection = sqlite3.connect(root / 'index.db')
     with connection:
         for statement in statements:
@@ -29,7 +29,7 @@ def run_sql(root: Path, *statements: str) -> None:
 
 
 def test_the_ledger_has_every_account(spool: Spool, root: Path) -> None:
-    """Every figure of the ledger's contract, from one session of two topics."""
+    """Every number of the ledger's contract, from one session of two topics."""
     with spool.accounts.entry('/camera') as account:
         account.type = 'sensor_msgs/msg/CompressedImage'
         for number in (*range(1, 9), 11):
@@ -91,7 +91,7 @@ def test_the_ledger_has_every_account(spool: Spool, root: Path) -> None:
 
 
 def test_sessions_add_up(opened: Open, root: Path) -> None:
-    """Totals are over all sessions, and no better than the worst of them; the grade is that of the newest."""
+    """Totals cover all sessions, and are no more exact than the worst of them; the grade is that of the newest."""
     for number in (1, None, 5):
         spool = opened()
         with spool.accounts.entry('/camera') as account:
@@ -106,12 +106,12 @@ def test_sessions_add_up(opened: Open, root: Path) -> None:
 
 
 def test_the_ledger_is_read_while_the_node_runs(root: Path) -> None:
-    """Every ledger read while another process writes is of one instant and closes."""
+    """Every ledger read while another process writes is a consistent snapshot and balances."""
     with started('load', root) as child:
         assert child.stdout is not None
         seen = set()
         for _ in range(80):
-            assert child.stdout.readline()  # it goes on: two lines for four messages
+            assert child.stdout.readline()  # it is still running: two lines for four messages
             found = ledger.read(root, 'thor')
             assert ledger.imbalances(found) == []
             seen.add(found['topics']['/camera']['received'])
@@ -119,13 +119,12 @@ def test_the_ledger_is_read_while_the_node_runs(root: Path) -> None:
 
 
 def test_the_ledger_of_an_empty_spool_balances(spool: Spool, root: Path) -> None:
-    """A spool in which nothing happened has a ledger that closes."""
     found = assert_whole(root)
     assert (found['topics'], found['objects']['spooled']) == ({}, 0)
 
 
 def test_a_missing_spool_is_an_error(tmp_path: Path) -> None:
-    """Without a spool the error names the folder, and none is made."""
+    """Without a spool the error names the folder, and no spool is created."""
     with pytest.raises(SpoolError, match=r'no spool in .*elsewhere.*SHADOWHOUND_HOME'):
         ledger.read(tmp_path / 'elsewhere', 'thor')
     assert not (tmp_path / 'elsewhere').exists()
@@ -133,7 +132,7 @@ def test_a_missing_spool_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('content', [b'', b'garbage' * 1000, None])
 def test_an_unreadable_index_is_an_error(opened: Open, root: Path, content: bytes | None) -> None:
-    """A damaged index, or one whose values are none, is an error with a remedy."""
+    """A damaged index, or one with invalid values, is an error with a remedy."""
     spool = opened()
     put(spool, make())
     spool.close()
@@ -177,7 +176,7 @@ def test_an_imbalance_is_found(spool: Spool, root: Path, statement: str, sentenc
 
 
 def test_missed_is_split_by_cause(spool: Spool, root: Path) -> None:
-    """A ledger whose missed messages do not add up over their causes is found, wherever it came from."""
+    """A ledger in which the causes do not add up to missed is reported, wherever it came from."""
     put(spool, make())
     found = assert_whole(root)
     found['topics']['/camera']['missed_by'] = {'restart': 1}
@@ -185,7 +184,7 @@ def test_missed_is_split_by_cause(spool: Spool, root: Path) -> None:
 
 
 def test_totals_are_those_of_the_rows(spool: Spool, root: Path) -> None:
-    """What the triggers count is what a count of the rows gives."""
+    """The totals kept by triggers equal a count of the rows."""
     items = put(spool, *(make(f'{number}', bytes(number), topic=f'/{number % 3}') for number in range(30)))
     for item, state in zip(items, [State.DELIVERED, State.QUARANTINED, State.DEDUPLICATED] * 5, strict=False):
         settle(spool, item, state)

@@ -23,7 +23,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
-    """A finished file beside the spool."""
+    """A finished file next to the spool."""
     path = tmp_path / 'bags' / 'patrol_0.mcap'
     path.parent.mkdir()
     path.write_bytes(CONTENT)
@@ -31,12 +31,12 @@ def source(tmp_path: Path) -> Path:
 
 
 def sliced(source: Path, **fields: object) -> DataObject:
-    """The object whose content is the file."""
+    """An object with the file as its content."""
     return make(**{'key': KEY, 'body': FileBody(source, len(CONTENT), SHA256), 'topic': None, **fields})
 
 
 def test_a_file_is_linked_not_copied(spool: Spool, root: Path, source: Path) -> None:
-    """The very file lies under its final name, described, and its source is gone."""
+    """The same inode is under its final name, with a description, and its source is removed."""
     inode = source.stat().st_ino
     (item,) = put(spool, sliced(source, metadata={'bag': 'patrol'}))
     assert (item.size, item.sha256, item.key) == (len(CONTENT), SHA256, KEY)
@@ -50,10 +50,10 @@ def test_a_file_is_linked_not_copied(spool: Spool, root: Path, source: Path) -> 
 
 
 def test_a_file_is_not_read_under_the_lock(opened: Open, root: Path, source: Path) -> None:
-    """A file of hundreds of megabytes costs a commit no more than a small one: nothing of it is read."""
+    """A file of hundreds of megabytes takes no longer to commit than a small one: its content is not read."""
     spool = opened(max_bytes=1 << 50)
     with source.open('ab') as file:
-        file.truncate(8 << 40)  # sparse: to read it would take hours
+        file.truncate(8 << 40)  # sparse: reading it would take hours
     (item,) = put(spool, sliced(source, body=FileBody(source, 8 << 40, SHA256)))
     assert item.path.stat().st_size == 8 << 40
     assert rows(root)[0]['bytes'] == 8 << 40
@@ -63,7 +63,7 @@ def test_a_file_is_not_read_under_the_lock(opened: Open, root: Path, source: Pat
 def test_a_file_that_cannot_be_linked_is_copied(
     spool: Spool, root: Path, source: Path, monkeypatch: pytest.MonkeyPatch, code: int
 ) -> None:
-    """One of another file system, or of one without links, is copied before the spool's lock is taken."""
+    """A file from another file system, or one without hard links, is copied before the spool's lock is taken."""
 
     def refuse(*_: object) -> None:
         assert not spool._connections.lock.locked()
@@ -77,7 +77,7 @@ def test_a_file_that_cannot_be_linked_is_copied(
 
 
 def test_a_commit_that_fails_leaves_the_source(spool: Spool, root: Path, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing of it is left in the spool, and the same commit works later."""
+    """Nothing of it stays in the spool, and the same commit works later."""
     item = sliced(source)
 
     def fail() -> None:
@@ -97,7 +97,7 @@ def test_a_commit_that_fails_leaves_the_source(spool: Spool, root: Path, source:
 def test_a_file_survives_a_transaction_that_needs_the_ballast(
     spool: Spool, root: Path, source: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the disk was full once the file was taken, the second try takes the same file."""
+    """If the disk was full after the file was taken, the second try takes the same file."""
     put(spool, make('thor/first.jpg'))
     assert (root / 'ballast').stat().st_size
     take_part, full = Tree.take_part, [OSError(errno.ENOSPC, 'full')]
@@ -116,7 +116,7 @@ def test_a_file_survives_a_transaction_that_needs_the_ballast(
 
 
 def test_a_removed_source_is_missing(spool: Spool, root: Path, source: Path) -> None:
-    """It is in the ledger as quarantined, and bars the way to nothing that is committed with it."""
+    """It is quarantined in the ledger, and does not block the objects committed with it."""
     source.unlink()
     (other,) = put(spool, sliced(source), make('thor/other.jpg'))
     assert other.key == 'thor/other.jpg'
@@ -127,7 +127,7 @@ def test_a_removed_source_is_missing(spool: Spool, root: Path, source: Path) -> 
 
 
 def test_a_file_without_room_is_given_up(opened: Open, root: Path, source: Path) -> None:
-    """It is evicted, its source with it; one that is protected is taken in all the same."""
+    """It is evicted along with its source; a protected one is added anyway."""
     spool = opened(max_bytes=len(CONTENT) - 1)
     assert put(spool, sliced(source)) == []
     assert not source.exists()
@@ -139,7 +139,7 @@ def test_a_file_without_room_is_given_up(opened: Open, root: Path, source: Path)
 
 
 def test_a_linked_file_needs_no_free_space(opened: Open, root: Path, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It lies on the disk already: only the quota counts it, not the space that is to be left free."""
+    """It is already on the disk: only the quota counts it, not the minimum of free space."""
     spool = opened(min_free_bytes=1 << 20, max_bytes=1 << 50)
     monkeypatch.setattr(spool._tree, 'free_bytes', lambda: (1 << 20) + 16_384)
     (item,) = put(spool, sliced(source, body=FileBody(source, 1 << 40, SHA256)))
@@ -147,7 +147,7 @@ def test_a_linked_file_needs_no_free_space(opened: Open, root: Path, source: Pat
 
 
 def test_content_under_a_key_is_known(spool: Spool, source: Path) -> None:
-    """The spool knows what it was given under a key, also when that got a number, and also after delivery."""
+    """The spool knows the content of each key, also when the key got a number, and after delivery."""
     assert not spool.reading.objects.knows(BUCKET, KEY, SHA256)
     put(spool, make(KEY, b'a foreign writer'))
     assert not spool.reading.objects.knows(BUCKET, KEY, SHA256)
@@ -160,7 +160,7 @@ def test_content_under_a_key_is_known(spool: Spool, source: Path) -> None:
 
 
 def test_a_kill_at_any_moment_of_taking_a_file_loses_nothing(tmp_path: Path, root: Path, moments: Moments) -> None:
-    """The source is there or the spool knows it, and never is half of it anywhere."""
+    """The source exists or the spool has the object, and no incomplete file exists anywhere."""
     new_spool(root).open()
 
     def work() -> None:
@@ -186,7 +186,7 @@ def test_a_kill_at_any_moment_of_taking_a_file_loses_nothing(tmp_path: Path, roo
 
 
 def test_the_copy_of_a_killed_process_is_removed(opened: Open, root: Path) -> None:
-    """That of one that lives stays: it is about to be committed."""
+    """The copy of a running process is kept: it is about to be committed."""
     dead, alive = opened(), opened()
     assert dead._session is not None
     assert alive._session is not None
@@ -201,7 +201,7 @@ def test_the_copy_of_a_killed_process_is_removed(opened: Open, root: Path) -> No
 
 
 def test_large_files_are_adopted_after_the_loss_of_the_index(opened: Open, root: Path, source: Path) -> None:
-    """They are hashed in pieces, and are what they said they were."""
+    """They are hashed in pieces, and match their descriptions."""
     spool = opened()
     put(spool, sliced(source, priority=2, protected=True))
     spool.close()
@@ -214,10 +214,10 @@ def test_large_files_are_adopted_after_the_loss_of_the_index(opened: Open, root:
 
 
 def test_files_take_no_memory_in_the_queue(root: Path, tmp_path: Path) -> None:
-    """A queue of large files does not make the encoders wait for the disk."""
+    """Encoders do not wait for the disk because of a queue of large files."""
     spool = new_spool(root, FakeClock())
     spool.open()
-    writer = SpoolWriter(spool, 0.0)  # not open: nothing leaves the queue
+    writer = SpoolWriter(spool, 0.0)  # not open: the queue is not drained
     for number in range(3):
         path = tmp_path / f'{number}.mcap'
         path.write_bytes(CONTENT)

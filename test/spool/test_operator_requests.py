@@ -1,4 +1,4 @@
-"""What operators asked for outlives the node and leaves it with the ledger."""
+"""Requests of operators persist after the node exits and are part of the ledger."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shadowhound_data_logger.spool.operator_requests import MAX_BYTES, MAX_REQUE
 
 
 def test_the_newest_requests_survive_the_process(tmp_path: Path) -> None:
-    """So many of them, in their order, each with who, what, when and the answer; of another robot none."""
+    """Up to a limit, in order, each with who, what, when and the response; those of other robots are not included."""
     now_ns = count(1).__next__
     record = OperatorRequests(tmp_path, 'thor', now_ns)
     for number in range(MAX_REQUESTS):
@@ -44,7 +44,7 @@ def test_the_newest_requests_survive_the_process(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_file_is_empty(tmp_path: Path, damage: bytes) -> None:
-    """And the next act is kept."""
+    """The next request is saved."""
     operator_requests.file(tmp_path, 'thor').write_bytes(damage)
     assert operator_requests.read(tmp_path, 'thor') == []
     OperatorRequests(tmp_path, 'thor', lambda: 1).add('operator', 'flush', ok=True, answer='done')

@@ -1,4 +1,4 @@
-"""Recovery at the start of a spool: after kills at any moment, lost logs and damaged files the ledger balances."""
+"""Recovery at startup: after kills at any moment, lost logs and damaged files the ledger balances."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from shadowhound_data_logger.spool.spool import Spool
 
 
 def test_a_clean_stop_leaves_nothing_to_recover(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """A clean stop leaves nothing to recover and every file where it was."""
+    """Every file is where it was."""
     assert reopened(opened, root) == {}
     assert files(root) == used
 
 
 @pytest.mark.parametrize('content', [b'', b'x', b'longer than it was'])
 def test_a_file_of_another_size_is_quarantined(opened: Open, root: Path, used: dict[str, bytes], content: bytes) -> None:
-    """A cut file is quarantined as damaged."""
+    """A truncated file is quarantined as damaged."""
     (root / READY / 'thor/a/2.jpg').write_bytes(content * 3)
     assert reopened(opened, root) == {'files damaged': 1}
     assert (root / f'quarantine/damaged/{BUCKET}/thor/a/2.jpg').read_bytes() == content * 3
@@ -57,7 +57,7 @@ def test_an_object_without_its_file_is_quarantined(opened: Open, root: Path, use
 
 @pytest.mark.parametrize('where', [READY, f'quarantine/missing/{BUCKET}'])
 def test_a_missing_file_that_reappears_is_adopted(opened: Open, root: Path, used: dict[str, bytes], where: str) -> None:
-    """A file that was moved away and back is delivered after all; another one in its place is set aside."""
+    """A file that was moved away and back is delivered; a different file in its place is set aside."""
     paths = [root / READY / f'thor/a/{number}.jpg' for number in (2, 3)]
     for path in paths:
         path.unlink()
@@ -74,7 +74,7 @@ def test_a_missing_file_that_reappears_is_adopted(opened: Open, root: Path, used
 
 @pytest.mark.parametrize('empty', [True, False])
 def test_a_folder_in_place_of_a_file_is_set_aside(opened: Open, root: Path, used: dict[str, bytes], empty: bool) -> None:
-    """A folder in an object's place leaves the object missing, and what lies in it is adopted."""
+    """The object is missing, and the contents of the folder are adopted."""
     path = root / READY / 'thor/a/2.jpg'
     path.unlink()
     path.mkdir()
@@ -84,7 +84,7 @@ def test_a_folder_in_place_of_a_file_is_set_aside(opened: Open, root: Path, used
 
 
 def test_a_part_is_sent_although_a_folder_is_at_its_path(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """A part whose place is taken is shipped from where it is."""
+    """A part whose final path is taken is shipped from where it is."""
     (row,) = (row for row in rows(root) if row['key'] == 'thor/a/2.jpg')
     path = root / READY / 'thor/a/2.jpg'
     os.replace(path, root / 'incoming' / f'{row["id"]}.part')
@@ -98,13 +98,12 @@ def test_a_part_is_sent_although_a_folder_is_at_its_path(opened: Open, root: Pat
 
 
 def test_parts_without_a_row_are_removed(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """A part that was never committed is removed."""
     (root / 'incoming/4711.part').write_bytes(b'x')
     assert reopened(opened, root) == {'uncommitted parts removed': 1}
 
 
 def test_open_messages_of_a_dead_session_are_dropped(root: Path, opened: Open) -> None:
-    """What a session had received without an outcome when it died is dropped by restart, for each topic."""
+    """Messages that a session had received without an outcome when it was killed are dropped by restart, for each topic."""
     dead = new_spool(root, FakeClock())
     dead.open()
     receive(dead, 5)
@@ -117,13 +116,13 @@ def test_open_messages_of_a_dead_session_are_dropped(root: Path, opened: Open) -
 
 
 def test_a_clock_that_went_back_changes_nothing(opened: Open, root: Path, clock: FakeClock, used: dict[str, bytes]) -> None:
-    """A start with a clock before all that is in the spool changes nothing."""
+    """Starting with a clock before every time in the spool changes nothing."""
     clock.now_ns = NOON_NS // 100
     assert reopened(opened, root) == {}
 
 
 def test_empty_folders_are_removed(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """Folders of past days that are empty are removed, the spool's own are not."""
+    """Empty folders of past days are removed, the spool's folders are not."""
     (root / READY / 'thor/camera/20200101').mkdir(parents=True)
     opened().close()
     assert not (root / READY / 'thor/camera').exists()
@@ -154,7 +153,7 @@ def lose_log(root: Path) -> None:
 @pytest.mark.parametrize('before', ['nothing', 'a session'])
 @pytest.mark.parametrize('moment', ['committed', 'checkpointed'])
 def test_committed_objects_survive_the_loss_of_the_log(opened: Open, root: Path, before: str, moment: str) -> None:
-    """Died before the files of a commit had their names: they are adopted, whatever else the index still knows."""
+    """If the process was killed before the files of a commit had their names, they are adopted, whatever the index contains."""
     if before == 'a session':
         spool = opened()
         settle(spool, put(spool, make('thor/before.jpg'))[0], State.DELIVERED)
@@ -169,7 +168,7 @@ def test_committed_objects_survive_the_loss_of_the_log(opened: Open, root: Path,
 
 
 def test_an_uncommitted_file_is_removed(opened: Open, root: Path) -> None:
-    """With its log the index knows all that was promised; what was not is lost at the restart, and said to be."""
+    """With its log the index knows every committed file; anything else is lost by the restart, and reported as such."""
     died(root, 'uncommitted')
     done = reopened(opened, root)
     assert done['files not committed'] == 2
@@ -177,7 +176,7 @@ def test_an_uncommitted_file_is_removed(opened: Open, root: Path) -> None:
 
 
 def test_an_incomplete_part_is_not_adopted(opened: Open, root: Path) -> None:
-    """A cut one is removed, log or not, and the other one of its commit is kept."""
+    """A truncated part is removed, with or without the log, and the other one of its commit is kept."""
     died(root, 'committed')
     part = min((root / 'incoming').iterdir())
     part.write_bytes(part.read_bytes()[:-1])
@@ -188,7 +187,7 @@ def test_an_incomplete_part_is_not_adopted(opened: Open, root: Path) -> None:
 
 
 def test_a_part_has_its_first_name_again_after_a_power_cut(opened: Open, root: Path) -> None:
-    """The commit is durable, the names that it gave are not: the content is found by its checksum, also without attributes."""
+    """The commit is durable, its renames are not: the content is found by its checksum, even without attributes."""
     died(root, 'committed')
     parts = sorted((root / 'incoming').iterdir())
     assert len(parts) == 2
@@ -211,7 +210,7 @@ def reopened_spool(root: Path) -> Spool:
 
 
 def test_a_kill_at_any_moment_of_a_commit_loses_nothing(root: Path, moments: Moments) -> None:
-    """Objects, deliveries and accounts are there as a whole (from the transaction on) or not at all, and can be used."""
+    """Objects, deliveries and accounts are all there (from the transaction on) or not at all, and can be used."""
     spool = reopened_spool(root)
     put(spool, make('old', b'old'), make('refused', b'refused'))
     spool.close()
@@ -232,7 +231,7 @@ def test_a_kill_at_any_moment_of_a_commit_loses_nothing(root: Path, moments: Mom
         committed = 'new/0' in state
         if committed:
             assert state['old'] == 'delivered'
-            assert state['refused'] in {'quarantined', 'pending'}, 'at the worst it is tried once more'
+            assert state['refused'] in {'quarantined', 'pending'}, 'at worst it is tried once more'
             assert (state['new/0'], state['new/1'], state['new/held']) == ('pending', 'pending', 'held')
             assert (topic['received'], topic['stored'], sum(topic['dropped'].values())) == (6, 5, 1)
         else:
@@ -247,7 +246,7 @@ def test_a_kill_at_any_moment_of_a_commit_loses_nothing(root: Path, moments: Mom
 
 
 def goes_on(spool: Spool, root: Path, *, committed: bool) -> None:
-    """What is left can be delivered, new objects get keys of their own, and a gap in the numbers is the restart's."""
+    """Pending objects can be delivered, new objects get unique keys, and a gap in the numbers is missed by restart."""
     for item in spool.pending(9):
         assert hashlib.sha256(item.path.read_bytes()).hexdigest() == item.sha256
         settle(spool, item, State.DELIVERED)
@@ -257,9 +256,9 @@ def goes_on(spool: Spool, root: Path, *, committed: bool) -> None:
     assert assert_whole(root)['topics']['/camera']['missed_by'] == {'restart': 3 if committed else 7}
 
 
-@pytest.mark.long('a death after each step')
+@pytest.mark.long('a kill after each step')
 def test_a_kill_at_any_moment_of_an_eviction_loses_nothing(root: Path, moments: Moments) -> None:
-    """Whatever was evicted is so in the ledger and has no file; the object that needed the room is there or not."""
+    """Evicted objects are evicted in the ledger and have no file; the new object is there or not."""
     spool = new_spool(root, max_bytes=1 << 20)
     spool.open()
     put(spool, *(make(f'{number}', bytes(200_000)) for number in range(4)))
@@ -285,7 +284,7 @@ def test_a_kill_at_any_moment_of_an_eviction_loses_nothing(root: Path, moments: 
 
 
 def leave_a_mess(root: Path) -> None:
-    """A spool of a process that died, with all that a start has to repair."""
+    """Return the spool of a killed process, with everything that startup must repair."""
     spool = reopened_spool(root)
     items = put(spool, *(make(f'a/{number}', b'%d' % number) for number in range(7)))
     settle(spool, items[0], State.DELIVERED)
@@ -294,8 +293,8 @@ def leave_a_mess(root: Path) -> None:
     spool.commit()
     abandon(spool)
     ready = root / 'ready' / BUCKET / 'a'
-    (ready / '0').write_bytes(b'0')  # delivered, not removed
-    (root / f'quarantine/refused/{BUCKET}/a/1').rename(ready / '1')  # quarantined by the index, the file not there yet
+    (ready / '0').write_bytes(b'0')  # delivered, but not removed
+    (root / f'quarantine/refused/{BUCKET}/a/1').rename(ready / '1')  # quarantined by the index, but the file is not moved yet
     (ready / '2').rename(root / f'incoming/{items[2].id}.part')
     (ready / '3').unlink()
     (ready / '4').write_bytes(b'cut')
@@ -305,16 +304,16 @@ def leave_a_mess(root: Path) -> None:
 
 
 def settled(root: Path) -> dict[str, Any]:
-    """What a spool comes to at the end of a start."""
+    """The state of a spool at the end of startup."""
     found = assert_whole(root)
     return {'rows': {(row['key'], row['state'], row['reason'], row['sha256']) for row in rows(root)}, 'files': files(root),
             'topics': found['topics'], 'objects': found['objects']}  # fmt: skip
 
 
 @pytest.mark.parametrize('index', ['whole', 'lost'])
-@pytest.mark.long('a death after each step')
+@pytest.mark.long('a kill after each step')
 def test_a_kill_at_any_moment_of_a_start_is_recovered(root: Path, moments: Moments, index: str) -> None:
-    """A start that died half-way is completed by the next one, as if it had been the first, also when it rebuilt the index."""
+    """The next start completes an interrupted one with the same result, also if it rebuilt the index."""
     leave_a_mess(root)
     if index == 'lost':
         for name in ('index.db-wal', 'index.db-shm'):
@@ -330,7 +329,7 @@ def test_a_kill_at_any_moment_of_a_start_is_recovered(root: Path, moments: Momen
 
 
 def test_a_running_session_is_not_settled(opened: Open, root: Path) -> None:
-    """A second process that opens the spool leaves what is open in the first one open."""
+    """A second process that opens the spool does not touch the open messages of the first."""
     one = opened()
     put(one, make())
     with one.accounts.entry('/camera') as account:

@@ -1,4 +1,4 @@
-"""Equal content that follows itself: kept once, counted each time, and found again."""
+"""Consecutive equal content: stored once, counted each time, and found again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shadowhound_data_logger.spool.spool import Spool
 
 
 def picture(second: int, body: bytes = b'the same', **fields: object) -> DataObject:
-    """What a camera with ``dedup`` shows in a second."""
+    """What a camera with ``dedup`` captures in a second."""
     at_ns = NOON_NS + second * 1_000_000_000
     given = {'dedup': True, 't_start_ns': at_ns, 't_end_ns': at_ns, **fields}
     return make(f'thor/camera/20251018/1200{second:02d}_front.jpg', body, **given)
@@ -32,11 +32,11 @@ def test_the_same_image_is_stored_once(spool: Spool, root: Path) -> None:
     found = assert_whole(root)
     assert found['objects'] == {**found['objects'], 'spooled': 3, 'pending': 1, 'deduplicated': 2}
     assert found['topics']['/camera']['stored'] == 3
-    assert all(row['settled_ns'] for row in repeats), 'they are forgotten in time'
+    assert all(row['settled_ns'] for row in repeats), 'they are forgotten eventually'
 
 
 def test_the_next_image_reports_the_repeats(spool: Spool) -> None:
-    """What was sent cannot be changed: the first object with other content has the count, the key and the end."""
+    """A delivered object cannot be changed: the first object with different content has the count, the key and the end."""
     put(spool, picture(0))
     put(spool, picture(1), picture(2))
     (item,) = put(spool, picture(3, b'another'))
@@ -47,7 +47,7 @@ def test_the_next_image_reports_the_repeats(spool: Spool) -> None:
 
 
 def test_only_consecutive_equal_content_is_a_repeat(spool: Spool) -> None:
-    """A picture that comes back later, that of another sensor, topic or bucket, and any without the setting are stored."""
+    """An image that appears again later, from another sensor, topic or bucket, or without the setting, is stored."""
     put(spool, picture(0))
     assert len(put(spool, picture(1, b'another'), picture(2))) == 2
     others = [
@@ -58,7 +58,7 @@ def test_only_consecutive_equal_content_is_a_repeat(spool: Spool) -> None:
 
 
 def test_delivered_content_counts_and_lost_content_does_not(opened: Open, root: Path) -> None:
-    """A repeat of what was evicted or quarantined is stored: nothing else holds it."""
+    """A repeat of an evicted or quarantined object is stored: no other object has its content."""
     spool = opened()
     (item,) = put(spool, picture(0))
     settle(spool, item, State.DELIVERED)
@@ -70,14 +70,14 @@ def test_delivered_content_counts_and_lost_content_does_not(opened: Open, root: 
 
 
 def test_an_object_without_a_date_is_not_a_repeat(spool: Spool) -> None:
-    """Its key is a provisional one, so nothing can name it."""
+    """Its key is provisional, so nothing can refer to it."""
     put(spool, picture(0, held='clock'), picture(1, held='clock'))
     assert len(spool.reading.objects.held('clock')) == 2
     assert len(put(spool, picture(2))) == 1
 
 
 def test_a_failed_commit_does_not_count_as_stored_content(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tried again, the same objects come to the same end."""
+    """When retried, the same objects have the same result."""
     receive(spool, 3)
     group = [picture(0), picture(1), picture(2, b'new')]
     with monkeypatch.context() as broken:
@@ -91,7 +91,7 @@ def test_a_failed_commit_does_not_count_as_stored_content(spool: Spool, root: Pa
 
 
 def test_an_object_with_repeats_is_never_evicted(opened: Open, root: Path) -> None:
-    """An outage that fills the spool costs what stands for itself alone."""
+    """An outage that fills the spool evicts objects without repeats first."""
     spool = opened(max_bytes=100_000)
     put(spool, picture(0, bytes(20_000)), picture(1, bytes(20_000)))
     for second in range(2, 12):
@@ -103,7 +103,7 @@ def test_an_object_with_repeats_is_never_evicted(opened: Open, root: Path) -> No
 
 
 def test_a_restart_stores_the_image_again(opened: Open, root: Path) -> None:
-    """What another process stored is not known: one more object, and none is lost."""
+    """Content stored by another process is unknown: one extra object, and none is lost."""
     spool = opened()
     put(spool, picture(0))
     spool.close()
@@ -112,7 +112,7 @@ def test_a_restart_stores_the_image_again(opened: Open, root: Path) -> None:
 
 
 def test_the_catalog_has_a_row_for_each_repeat(spool: Spool, root: Path) -> None:
-    """With its own time and the key of its content, so that a query by time finds the picture."""
+    """With its time and the key of its content, so that a query by time finds the image."""
     (item,) = put(spool, picture(0))
     put(spool, picture(1))
     settle(spool, item, State.DELIVERED)
@@ -122,7 +122,7 @@ def test_the_catalog_has_a_row_for_each_repeat(spool: Spool, root: Path) -> None
 
 
 def test_a_repeat_cannot_be_requested(spool: Spool, root: Path) -> None:
-    """``verify`` asks the store for what was delivered, and a repeat never was."""
+    """``verify`` checks that delivered objects are in the store, and a repeat was never delivered."""
     (item,) = put(spool, picture(0))
     put(spool, picture(1))
     settle(spool, item, State.DELIVERED)

@@ -1,4 +1,4 @@
-"""A full disk is a decision, not a crash."""
+"""A full disk is handled by policy, not by a crash."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def states(root: Path) -> dict[str, str]:
 
 
 def test_a_full_disk_evicts_the_least_important_and_oldest_first(opened: Open, root: Path) -> None:
-    """Over max_bytes the lowest priority is evicted first, of one priority the oldest; held objects can go, too."""
+    """Over max_bytes the lowest priority is evicted first, and the oldest within a priority; held objects can be evicted, too."""
     spool = opened(max_bytes=MEBI)
     put(spool, make('a5', BODY, priority=5), make('a9', BODY, priority=9, held='clock'), make('b9', BODY, priority=9))
     put(spool, make('a1', BODY, priority=1))
@@ -49,7 +49,7 @@ def test_a_full_disk_evicts_the_least_important_and_oldest_first(opened: Open, r
 
 
 def test_new_objects_evict_no_more_important_ones(opened: Open, root: Path) -> None:
-    """Where only what is more important could make room, the new object is the one that goes; of equals the oldest."""
+    """If only more important objects could make room, the new object is evicted; among equals the oldest."""
     spool = opened(max_bytes=MEBI)
     put(spool, *(make(f'a{number}', BODY, priority=3) for number in range(5)))
     assert put(spool, make('cloud', BODY, priority=7), make('pose', b'x', priority=3))[0].key == 'pose'
@@ -60,7 +60,7 @@ def test_new_objects_evict_no_more_important_ones(opened: Open, root: Path) -> N
 
 
 def test_a_group_larger_than_the_spool_is_refused(opened: Open, root: Path) -> None:
-    """Of a group that cannot be taken in as a whole the important ones are, and of equals the newest."""
+    """From a group that does not fit the important ones are taken, and among equals the newest."""
     spool = opened(max_bytes=MEBI)
     put(
         spool,
@@ -72,7 +72,7 @@ def test_a_group_larger_than_the_spool_is_refused(opened: Open, root: Path) -> N
 
 
 def test_a_shortage_is_logged_at_start_and_end(opened: Open, clock: FakeClock, caplog: pytest.LogCaptureFixture) -> None:
-    """A spool that is full for an hour says so once a minute, and when it is over, not with every commit."""
+    """A spool that is full for an hour logs it once per minute, and when it ends, not with every commit."""
     caplog.set_level(logging.INFO)
     spool = opened(max_bytes=MEBI)
     for number in range(100):
@@ -88,7 +88,7 @@ def test_a_shortage_is_logged_at_start_and_end(opened: Open, clock: FakeClock, c
 
 
 def test_protected_objects_are_never_evicted(opened: Open, root: Path) -> None:
-    """A protected object is never evicted, and is taken in even where there is no room."""
+    """A protected object is never evicted, and is added even if there is no room."""
     spool = opened(max_bytes=MEBI)
     put(spool, *(make(f'p{number}', BODY, protected=True, priority=9) for number in range(5)))
     put(spool, make('late', BODY, priority=0), make('p5', BODY, protected=True))
@@ -98,7 +98,7 @@ def test_protected_objects_are_never_evicted(opened: Open, root: Path) -> None:
 
 
 def test_an_object_that_can_never_fit_evicts_nothing(opened: Open, root: Path) -> None:
-    """An object larger than the spool is recorded as evicted, and nothing is evicted in vain for it."""
+    """An object larger than the spool is recorded as evicted, and nothing is evicted in vain."""
     spool = opened(max_bytes=MEBI)
     put(spool, make('small', b'x', priority=9))
     assert put(spool, make('huge', bytes(2 * MEBI), priority=0)) == []
@@ -107,19 +107,19 @@ def test_an_object_that_can_never_fit_evicts_nothing(opened: Open, root: Path) -
 
 
 def test_free_space_is_left(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Below min_free_bytes objects are evicted until enough is free, and no further."""
+    """Below min_free_bytes objects are evicted until enough is free, and no more."""
     spool = opened(min_free_bytes=10 * MEBI)
     put(spool, *(make(f'a{number}', BODY) for number in range(5)))
     total = 10 * MEBI + 5 * len(BODY)
     monkeypatch.setattr(Tree, 'free_bytes', lambda tree: total - sum(map(len, files(tree.root).values())))
     put(spool, make('b', BODY))
-    # Room for one object and its overhead: the second of the oldest goes for the overhead alone.
+    # Room for one object and its overhead: the second oldest is evicted for the overhead alone.
     assert [key for key, state in states(root).items() if state == 'evicted'] == ['a0', 'a1']
     assert_whole(root)
 
 
 def test_removed_files_use_no_space(opened: Open, root: Path) -> None:
-    """A person who empties the spool by hand gets its room back."""
+    """Space of files deleted by hand is available again."""
     spool = opened(max_bytes=MEBI)
     put(spool, *(make(f'a{number}', BODY) for number in range(4)))
     spool.close()
@@ -132,7 +132,7 @@ def test_removed_files_use_no_space(opened: Open, root: Path) -> None:
 
 
 def test_an_object_evicted_during_its_upload_is_no_error(opened: Open, root: Path) -> None:
-    """The outcome of an object that was evicted meanwhile leaves the ledger closed."""
+    """The ledger balances after its outcome."""
     spool = opened(max_bytes=MEBI)
     items = put(spool, *(make(f'a{number}', BODY) for number in range(5)))
     put(spool, make('b', BODY))
@@ -145,7 +145,7 @@ def full(*_: Any, **__: Any) -> None:
 
 
 def test_no_space_for_a_payload_leaves_nothing_behind(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A commit that runs out of space in its third payload leaves nothing behind, and the next one balances."""
+    """A commit that runs out of space in its third payload leaves no files, and the next one balances."""
     write_body, written = Tree.write_body, list[Path]()
 
     def third_fails(path: Path, *rest: Any) -> None:
@@ -170,7 +170,7 @@ def test_no_space_for_a_payload_leaves_nothing_behind(spool: Spool, root: Path, 
 def test_a_payload_that_cannot_be_written_fails_the_commit(
     spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
-    """A part of which a write, sync or its creation failed does not stay."""
+    """A part with a failed creation, write or sync is removed."""
     with monkeypatch.context() as patch:
         if failing == 'write':
             patch.setattr('shadowhound_data_logger.spool.files.describe', full)
@@ -184,7 +184,7 @@ def test_a_payload_that_cannot_be_written_fails_the_commit(
 
 
 def test_every_kind_of_full_disk_is_the_same_error(spool: Spool) -> None:
-    """Whether the index or a file found it: a log that tells each new error once tells one."""
+    """Whether the index or a file detected it: a log that reports each new error once reports one."""
     errors = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), sqlite3.OperationalError('database or disk is full')
     (told,) = {str(unwritable(spool.root, error)) for error in errors}
     assert 'No space left on device' in told
@@ -192,7 +192,7 @@ def test_every_kind_of_full_disk_is_the_same_error(spool: Spool) -> None:
 
 def test_a_part_that_cannot_be_removed_stops_nothing(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch,
                                        caplog: pytest.LogCaptureFixture) -> None:  # fmt: skip
-    """A disk that is read-only from the middle of a part on says so each time, and nothing else; later it goes on."""
+    """A disk that becomes read-only during a part reports it each time, and nothing more; later the commit succeeds."""
 
     def read_only(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -214,7 +214,7 @@ def test_a_part_that_cannot_be_removed_stops_nothing(spool: Spool, root: Path, m
 def test_no_space_for_the_index_keeps_deliveries_pending(
     spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch, table: type, step: str
 ) -> None:
-    """A transaction that fails takes its payloads with it, keeps the deliveries pending, and can be tried again."""
+    """A failed transaction removes its payloads, keeps the deliveries pending, and can be retried."""
     (delivered,) = put(spool, make('old'))
     outcome = [Outcome(delivered, State.DELIVERED)]
     with monkeypatch.context() as patch:
@@ -235,7 +235,7 @@ def test_no_space_for_the_index_keeps_deliveries_pending(
 
 
 def test_an_index_that_cannot_grow_is_a_full_disk(spool: Spool, root: Path) -> None:
-    """When SQLite itself finds the disk full, the spool goes on once there is space."""
+    """When SQLite itself finds the disk full, the spool continues once there is space."""
     index = spool._connections.writing
     pages = index._db.execute('PRAGMA page_count').fetchone()[0]
     index._db.execute(f'PRAGMA max_page_count = {pages}')
@@ -249,10 +249,10 @@ def test_an_index_that_cannot_grow_is_a_full_disk(spool: Spool, root: Path) -> N
 
 
 def test_a_commit_that_fails_at_its_end_can_be_repeated(spool: Spool, root: Path) -> None:
-    """A COMMIT that SQLite refuses is rolled back, and does not leave the writer in a transaction for ever."""
+    """A COMMIT that SQLite refuses is rolled back, and does not keep the writer in a transaction permanently."""
 
     class Refusing:
-        """A connection whose first COMMIT fails."""
+        """A connection with a first COMMIT that fails."""
 
         def __init__(self, connection: sqlite3.Connection) -> None:
             self.connection, self.refused = connection, False
@@ -276,7 +276,7 @@ def test_a_commit_that_fails_at_its_end_can_be_repeated(spool: Spool, root: Path
 
 
 def test_no_space_for_a_folder_does_not_fail_the_commit(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rename that fails after the transaction does not fail the commit: the object would be written twice."""
+    """A rename that fails after the transaction does not fail the commit: otherwise the object would be written twice."""
     with monkeypatch.context() as patch:
         patch.setattr(Path, 'mkdir', full)
         (item,) = put(spool, make())
@@ -290,13 +290,13 @@ def test_no_space_for_a_folder_does_not_fail_the_commit(spool: Spool, root: Path
 
 
 def test_an_object_is_committed_without_a_description_that_does_not_fit(spool: Spool, root: Path) -> None:
-    """An attribute larger than the file system allows (ext4 calls it a full disk) costs the description only."""
+    """Only the description is lost if an attribute is larger than the file system allows (ext4 reports a full disk)."""
     assert len(put(spool, make(metadata={'note': 'x' * 100_000}))) == 1
     assert_whole(root)
 
 
 def test_a_failed_close_can_be_repeated(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last accounts are not lost when their commit fails the first time."""
+    """The last accounts are not lost if their commit fails the first time."""
     spool = opened()
     with spool.accounts.entry('/camera') as account:
         account.receive('p', 1)

@@ -1,4 +1,4 @@
-"""Implausible values in an index are found at the start; a home that a newer program wrote is refused."""
+"""Implausible values in an index are found at startup; a home written by a newer program is refused."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
 
 @pytest.fixture
 def index(opened: Open, root: Path) -> Path:
-    """Of a closed spool, with objects in every state and with the strangest names and times that are allowed."""
+    """The index of a closed spool, with objects in every state and the most unusual names and times that are allowed."""
     spool = opened()
     strange = make("thor/a..b/!x_'(1)=+@-.jpg", bucket='Other_Bucket.1', t_start_ns=-1, t_end_ns=2**63 - 1, priority=0)
     items = put(spool, strange, *(make(f'thor/{number}') for number in range(5)), make('thor/h', held='clock'))
@@ -34,7 +34,7 @@ def index(opened: Open, root: Path) -> Path:
 
 
 def test_valid_values_are_accepted(index: Path) -> None:
-    """No value that the spool itself wrote is called impossible, and its totals are those of its objects."""
+    """No value written by the spool itself is reported as impossible, and its totals match its objects."""
     with index_of(index.parent) as whole:
         whole.check()
         assert list(whole.miscounted()) == []
@@ -51,7 +51,7 @@ def test_valid_values_are_accepted(index: Path) -> None:
     ],
 )  # fmt: skip
 def test_impossible_values_are_found(index: Path, opened: Open, change: str) -> None:
-    """The index is rebuilt from the files then, and the start works."""
+    """The index is rebuilt from the files, and startup works."""
     with closing(sqlite3.connect(index)) as db:
         db.execute(f'UPDATE {change}')
         db.commit()
@@ -61,7 +61,7 @@ def test_impossible_values_are_found(index: Path, opened: Open, change: str) -> 
 
 
 def test_mismatching_totals_are_reported(index: Path, opened: Open, caplog: pytest.LogCaptureFixture) -> None:
-    """An object that counts for another topic than its total says shows in no sum of today, and is said all the same."""
+    """An object that counts for another topic than its total changes no overall total, and is reported anyway."""
     with closing(sqlite3.connect(index)) as db:
         db.execute("UPDATE objects SET topic = '/other' WHERE key = 'thor/3'")
         db.commit()
@@ -84,7 +84,7 @@ def test_a_newer_home_is_left_alone(tmp_path: Path, killed: bool) -> None:
     db = sqlite3.connect(root / 'index.db', isolation_level=None)
     db.execute('CREATE TABLE newer (id)')
     db.execute(f'PRAGMA user_version = {SCHEMA_VERSION + 1}')
-    if killed:  # before a checkpoint: the changes are in the log alone
+    if killed:  # before a checkpoint: only the log has the changes
         root = Path(shutil.copytree(root, tmp_path / 'newer'))
         assert (root / 'index.db-wal').stat().st_size
     db.close()
@@ -100,6 +100,6 @@ def test_a_newer_home_is_left_alone(tmp_path: Path, killed: bool) -> None:
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Of all files but locks, which are empty, and what SQLite keeps beside an index for those that read it."""
+    """All files except the (empty) locks and the files that SQLite keeps next to an index for its readers."""
     found = {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(root.rglob('*')) if path.is_file()}
     return {name: body for name, body in found.items() if body and not name.endswith('-shm')}

@@ -1,4 +1,4 @@
-"""Grades belong to sessions: what each knows and what it estimates."""
+"""Grades belong to sessions: what each one counts and what it estimates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ALONE = ArrivalContext(gid='a')
 
 def session(opened: Callable[..., Spool], received: int, first: int | None = None, context: ArrivalContext = ALONE, *,
             at: int | None = None, died: bool = False) -> None:  # fmt: skip
-    """So many messages come: numbered from ``first``, or sent in a rhythm from its place ``at``, or neither."""
+    """Receive messages: numbered from ``first``, or sent in a rhythm from position ``at``, or neither."""
     spool = opened()
     with spool.accounts.entry(TOPIC) as account:
         for offset in range(received):
@@ -46,7 +46,7 @@ def row(root: Path, topic: str = TOPIC) -> dict[str, Any]:
 
 
 def grades(root: Path) -> dict[str, tuple[Any, ...]]:
-    """Grade -> published, received, missed; the first and the last as they are estimated where they are not known."""
+    """Grade -> published, received, missed; the first and the last are estimates if they are unknown."""
     return {
         grade: (part['published'] or part['published_estimated'], part['received'],
                 part['missed'] if part['missed'] is not None else part['missed_estimated'])
@@ -55,7 +55,7 @@ def grades(root: Path) -> dict[str, tuple[Any, ...]]:
 
 
 def test_an_upgraded_robot_is_exact(opened: Open, root: Path) -> None:
-    """The grade is that of the newest session; what an earlier one did not know stays unknown, and stands apart."""
+    """The grade is that of the newest session; what was unknown in an earlier one stays unknown, and is listed separately."""
     session(opened, 10)
     session(opened, 5, first=1)
     found = row(root)
@@ -65,7 +65,7 @@ def test_an_upgraded_robot_is_exact(opened: Open, root: Path) -> None:
 
 
 def test_exact_and_estimated_sessions_are_an_estimate(opened: Open, root: Path) -> None:
-    """It is no better than the worse of them, and is not mixed with what is exact."""
+    """It is no better than the worse of them, and is not mixed with exact values."""
     session(opened, 10, first=1)
     session(opened, 300, at=0)
     session(opened, 300, at=310)
@@ -76,7 +76,7 @@ def test_exact_and_estimated_sessions_are_an_estimate(opened: Open, root: Path) 
 
 
 def test_a_session_without_a_message_has_no_grade(opened: Open, root: Path) -> None:
-    """It changes nothing; alone it is not called exact, and nothing is missed that nobody knows of."""
+    """It changes nothing; alone it is not called exact, and missed is unknown."""
     session(opened, 0)
     found = row(root)
     assert (found['accounting'], found['published'], found['missed'], found['by_grade']) == (None, None, None, {})
@@ -86,7 +86,7 @@ def test_a_session_without_a_message_has_no_grade(opened: Open, root: Path) -> N
 
 
 def test_the_rhythm_survives_a_kill(opened: Open, root: Path) -> None:
-    """A publisher that went on while the node was dead is known by its name, and the gap is counted."""
+    """A publisher that kept sending while the node was down is recognized by its name, and the gap is counted."""
 
     def mortal() -> Spool:
         spool = new_spool(root)
@@ -101,7 +101,7 @@ def test_the_rhythm_survives_a_kill(opened: Open, root: Path) -> None:
 
 @pytest.mark.parametrize('context', [ALONE._replace(gid='b'), ALONE._replace(gid='', is_only=False)])
 def test_a_gap_before_another_publisher_is_no_loss(opened: Open, root: Path, context: ArrivalContext) -> None:
-    """Nor one before several; the rhythm is known all the same."""
+    """Neither is one before several; the rhythm is still known."""
     session(opened, 300, at=0)
     session(opened, 20, context=context, at=400)
     found = row(root)
@@ -109,7 +109,7 @@ def test_a_gap_before_another_publisher_is_no_loss(opened: Open, root: Path, con
 
 
 def test_numbered_messages_in_between_are_not_missed(opened: Open, root: Path) -> None:
-    """Neither by the rhythm of an earlier session, nor by the numbers of one before that."""
+    """Neither by the rhythm of an earlier session, nor by the numbers of the one before it."""
     session(opened, 300, at=0)
     session(opened, 10, first=1)
     session(opened, 300, at=400)
@@ -118,7 +118,7 @@ def test_numbered_messages_in_between_are_not_missed(opened: Open, root: Path) -
 
 
 def test_another_declared_rate_starts_another_rhythm(opened: Open, root: Path) -> None:
-    """A counter's value is not a stamp."""
+    """A counter value is not a stamp."""
     session(opened, 300, at=0)
     spool = opened()
     with spool.accounts.entry(TOPIC) as account:
@@ -131,7 +131,7 @@ def test_another_declared_rate_starts_another_rhythm(opened: Open, root: Path) -
 
 
 def test_carried_messages_keep_their_grade(opened: Open, root: Path) -> None:
-    """Messages of a bag that the next session accounts for are as unknown, or estimated, as they were."""
+    """Messages of a bag that the next session accounts for stay unknown, or estimated, as before."""
     spool = opened()
     with spool.accounts.entry(f'{BAG}{TOPIC}') as account:
         for lost in (None, {'transport': 2}):

@@ -42,7 +42,7 @@ DAY_NS = 24 * 3600 * SECOND
 
 
 def test_a_commit_is_on_disk_under_its_final_name(spool: Spool, root: Path) -> None:
-    """What commit returns lies whole under ready/<bucket>/<key>, with the hash and what it is as metadata."""
+    """When commit returns, the complete object is under ready/<bucket>/<key>, with its hash and metadata."""
     (item,) = put(spool, make(metadata={'robot': 'thor'}))
     assert item.path == root / 'ready' / BUCKET / KEY
     assert item.path.read_bytes() == b'content'
@@ -55,19 +55,18 @@ def test_a_commit_is_on_disk_under_its_final_name(spool: Spool, root: Path) -> N
 
 
 def test_an_empty_commit_changes_nothing(spool: Spool, root: Path) -> None:
-    """Committing nothing is allowed."""
     assert spool.commit() == []
     assert rows(root) == []
 
 
 def test_pending_returns_the_committed_objects(spool: Spool) -> None:
-    """An object read back from the index equals the one that commit returned."""
+    """An object read from the index equals the one that commit returned."""
     items = put(spool, make(metadata={'robot': 'thor'}), make('thor/b', b''))
     assert spool.pending(5) == items
 
 
 def test_a_key_is_given_out_once(spool: Spool, root: Path) -> None:
-    """Objects that want one key get _1, _2, ..., in one commit and over several."""
+    """Objects that request the same key get _1, _2, ..., in one commit and over several."""
     items = put(spool, make(body=b'a'), make(body=b'b')) + put(spool, make(body=b'c'))
     assert [Path(item.key).name for item in items] == ['120000_front.jpg', '120000_front_1.jpg', '120000_front_2.jpg']
     assert [item.path.read_bytes() for item in items] == [b'a', b'b', b'c']
@@ -80,7 +79,7 @@ def test_the_same_key_in_two_buckets_is_two_keys(spool: Spool) -> None:
 
 
 def test_the_longest_key_can_be_numbered(spool: Spool, root: Path) -> None:
-    """A key at the limit of its length gets its number within the limit."""
+    """A key of maximum length gets its number within the limit."""
     key = 'thor/' + 'x' * (MAX_SEGMENT_BYTES - 4) + '.jpg'
     items = put(spool, make(key), make(key))
     assert {len(item.key) for item in items} == {len(key)}
@@ -88,7 +87,7 @@ def test_the_longest_key_can_be_numbered(spool: Spool, root: Path) -> None:
 
 
 def test_a_restart_within_a_second_gives_no_key_twice(opened: Open, root: Path) -> None:
-    """Delivered keys are remembered over a restart."""
+    """Delivered keys are remembered after a restart."""
     spool = opened()
     (item,) = put(spool, make())
     settle(spool, item, State.DELIVERED)
@@ -109,7 +108,7 @@ def test_delivered_objects_leave_the_disk(spool: Spool, root: Path) -> None:
 
 
 def test_an_outcome_counts_once(spool: Spool, root: Path) -> None:
-    """The first outcome of an object is final, and telling it again changes nothing."""
+    """The first outcome of an object is final, and reporting it again changes nothing."""
     (item,) = put(spool, make())
     settle(spool, item, State.DELIVERED)
     settle(spool, item, State.DELIVERED)
@@ -122,7 +121,7 @@ REASONS = [('refused', 'refused'), ('../../etc', '__.._etc'), ('', 'unknown'), (
 
 @pytest.mark.parametrize(('reason', 'folder'), REASONS)
 def test_quarantine_moves_the_file(spool: Spool, root: Path, reason: str | None, folder: str) -> None:
-    """A quarantined object is kept under its reason, inside the spool whatever the reason is."""
+    """A quarantined object is kept under its reason, inside the spool for any reason."""
     (item,) = put(spool, make())
     settle(spool, item, State.QUARANTINED, reason)
     assert list(files(root)) == [f'quarantine/{folder}/{BUCKET}/{KEY}']
@@ -131,18 +130,18 @@ def test_quarantine_moves_the_file(spool: Spool, root: Path, reason: str | None,
 
 
 def test_quarantine_moves_a_file_that_is_being_read(spool: Spool, root: Path) -> None:
-    """A question to the index that is half answered meanwhile, as a status is on a busy machine, does not hide the outcome."""
+    """A half-read query, as a status has on a busy machine, does not hide the outcome."""
     (item,) = put(spool, make())
     half = spool._connections.reading._db.execute('SELECT * FROM tally')
     assert half.fetchone()
     settle(spool, item, State.QUARANTINED, 'foreign')
-    assert half.fetchone(), 'it was not at its end'
+    assert half.fetchone(), 'the query was not finished'
     half.close()
     assert_whole(root)
 
 
 def test_held_objects_wait(spool: Spool, root: Path) -> None:
-    """An object without a final name is durable, but not offered for delivery."""
+    """An object without a final name is durable, but is not pending."""
     assert put(spool, make(held='clock')) == []
     assert spool.pending(1) == []
     assert list(files(root)) == [f'held/clock/{BUCKET}/{KEY}']
@@ -157,7 +156,7 @@ def test_pending_objects_are_ordered_by_priority_or_age(spool: Spool) -> None:
 
 
 def test_pending_excludes_objects(spool: Spool) -> None:
-    """Objects in hand and buckets that are shut do not use up the limit."""
+    """Objects being delivered and closed buckets do not count toward the limit."""
     items = put(spool, *(make(str(number)) for number in range(6)), make('x', bucket='shut'))
     taken = {item.id for item in items[:4]}
     assert [item.key for item in spool.pending(2, exclude=taken)] == ['4', '5']
@@ -165,7 +164,7 @@ def test_pending_excludes_objects(spool: Spool) -> None:
 
 
 def test_other_users_cannot_read(spool: Spool, root: Path) -> None:
-    """Folders of the spool are 700 and its files 600."""
+    """The spool's folders have mode 700 and its files 600."""
     put(spool, make(), make(held='clock'))
     mode = {path.relative_to(root).as_posix(): stat.S_IMODE(path.stat().st_mode) for path in [root, *root.rglob('*')]}
     assert {name: oct(bits) for name, bits in mode.items() if (root / name).is_file() and bits != 0o600} == {}
@@ -174,13 +173,13 @@ def test_other_users_cannot_read(spool: Spool, root: Path) -> None:
 
 
 def test_old_deliveries_are_forgotten_and_totals_stay(spool: Spool, root: Path, clock: FakeClock) -> None:
-    """After remember_days the rows of delivered objects go, the ledger does not change."""
+    """After remember_days the rows of delivered objects are removed; the ledger does not change."""
     delivered, kept = put(spool, make('a'), make('b'))
     settle(spool, delivered, State.DELIVERED)
     before = assert_whole(root)
     clock.now_ns += 31 * DAY_NS
     spool.commit()
-    assert len(rows(root)) == 2, 'the catalog has no row of it yet'
+    assert len(rows(root)) == 2, 'the catalog does not have its row yet'
     clear_uncataloged(root)
     clock.now_ns += DAY_NS
     spool.commit()
@@ -189,7 +188,7 @@ def test_old_deliveries_are_forgotten_and_totals_stay(spool: Spool, root: Path, 
 
 
 def test_forgetting_keeps_up_with_deliveries(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While more than one step is to be forgotten, each commit forgets one, not one an hour."""
+    """While more than one step is due, each commit forgets one, instead of one per hour."""
     monkeypatch.setattr('shadowhound_data_logger.spool.history_table.FORGET_STEP', 2)
     items = put(spool, *(make(str(number)) for number in range(5)))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
@@ -203,7 +202,7 @@ def test_forgetting_keeps_up_with_deliveries(spool: Spool, root: Path, clock: Fa
 
 
 def test_accounts_survive_a_stop(opened: Open, root: Path) -> None:
-    """What was counted and not yet committed is committed by close, and close may be called twice."""
+    """Close commits whatever is counted but not committed, and may be called twice."""
     spool = opened()
     receive(spool, 3)
     with spool.accounts.entry('/camera') as account:
@@ -230,7 +229,7 @@ def test_sequence_numbers_continue_after_a_stop(opened: Open, root: Path) -> Non
 
 @pytest.mark.parametrize('ends', [False, True])
 def test_sequence_numbers_are_separate_from_bag_record(opened: Open, *, ends: bool) -> None:
-    """What ``bag record`` hears beside a node, ended by now or not, counts neither for nor against the node's own bags."""
+    """Messages received by a ``bag record`` that runs next to a node, or did, do not affect the accounts of the node's bags."""
 
     def took(spool: Spool, *numbers: int) -> None:
         for account in ('/camera', f'{BAG}/camera'):
@@ -255,7 +254,7 @@ def test_sequence_numbers_are_separate_from_bag_record(opened: Open, *, ends: bo
 
 
 def test_one_process_drains(opened: Open) -> None:
-    """The drain lock is had once, and again after it was let go."""
+    """The drain lock is held once, and can be taken again after its release."""
     one, two = opened(), opened()
     with one.drain_lock() as first, two.drain_lock() as second:
         assert (first, second) == (True, False)
@@ -276,7 +275,7 @@ def test_the_drain_lock_ends_with_its_process(spool: Spool, root: Path) -> None:
 
 @pytest.mark.long('two processes')
 def test_two_processes_add_concurrently(opened: Open, root: Path) -> None:
-    """Both get all of their objects in, whole and under keys of their own, whoever opens the spool meanwhile."""
+    """Both add all of their objects, complete and with unique keys, even if other processes open the spool at the same time."""
     with started('add', root, 'one', 150) as one, started('add', root, 'two', 150) as two:
         for child in (one, two):
             assert child.stdout is not None
@@ -284,7 +283,7 @@ def test_two_processes_add_concurrently(opened: Open, root: Path) -> None:
         openings = 0
         while one.poll() is None or two.poll() is None:
             opener = opened()
-            assert opener.recovery.describe() in {'', '1 renames completed', '2 renames completed'}  # of each at most one
+            assert opener.recovery.describe() in {'', '1 renames completed', '2 renames completed'}  # at most one of each
             opener.close()
             openings += 1
     assert (one.returncode, two.returncode) == (0, 0)
@@ -296,7 +295,7 @@ def test_two_processes_add_concurrently(opened: Open, root: Path) -> None:
 
 
 def test_another_process_reads_what_was_added(opened: Open) -> None:
-    """What one process committed, the one that drains finds; and a part not renamed yet is renamed."""
+    """The draining process finds what another one committed; and a part not renamed yet is renamed."""
     adder, drainer = opened(), opened()
     (item,) = put(adder, make())
     os.replace(item.path, adder.root / 'incoming' / f'{item.id}.part')
@@ -306,14 +305,14 @@ def test_another_process_reads_what_was_added(opened: Open) -> None:
 
 
 def test_an_unusable_folder_is_an_error(tmp_path: Path) -> None:
-    """A spool where a file lies is refused with its name and a remedy."""
+    """A spool path that is a file is refused with its name and a remedy."""
     (tmp_path / 'spool').write_text('a file')
     with pytest.raises(SpoolError, match=r'spool cannot be used: .*SHADOWHOUND_HOME'):
         new_spool(tmp_path / 'spool').open()
 
 
 def test_an_unreadable_folder_stops_nothing(spool: Spool, root: Path) -> None:
-    """An object whose folder cannot be made is committed, shipped from where it is, and counted once."""
+    """An object whose folder cannot be created is committed, shipped from where it is, and counted once."""
     put(spool, make('thor/a'))
     (item,) = put(spool, make('thor/a/b', b'below'))
     assert item.path.read_bytes() == b'below'
@@ -324,14 +323,14 @@ def test_an_unreadable_folder_stops_nothing(spool: Spool, root: Path) -> None:
 
 
 def test_a_spool_that_was_not_opened_refuses_calls() -> None:
-    """Using a spool before it is open says so."""
+    """Using a spool before it is open raises an error."""
     with pytest.raises(SpoolError, match='not open'):
         new_spool(Path('nowhere')).pending(1)
 
 
 @pytest.fixture
 def hanging(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spool]:
-    """One object waits, and the sync of a second one does not return before the test is over."""
+    """One object is pending, and the sync of a second one does not return until the test ends."""
     put(spool, make('thor/first.jpg'))
     entered, let_go = threading.Event(), threading.Event()
 
@@ -349,12 +348,12 @@ def hanging(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spool]:
 
 
 def test_pending_objects_are_listed_during_a_hung_commit(hanging: Spool) -> None:
-    """The line in the log that says so must not hang, too."""
+    """The log line about it must not hang either."""
     assert hanging.pending_count() == 1
 
 
 def test_closing_does_not_wait_for_a_hung_commit(hanging: Spool, monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
-    """It says which disk it is, and can be repeated when that answers."""
+    """It names the disk, and can be repeated when the disk responds."""
     monkeypatch.setattr(spool_module, 'CLOSE_S', 0.01)
     with pytest.raises(SpoolError, match=f'{root} cannot be closed: its disk does not answer'):
         hanging.close()

@@ -1,4 +1,4 @@
-"""What a status file, the boot clock, the process table and the spool's index together say of a node."""
+"""What a status file, the boot clock, the process table and the spool's index together show about a node."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OWN = SpoolSettings(max_bytes=20 << 20, min_free_bytes=10)
 
 
 def written(root: Path, **changes: Any) -> None:
-    """A status as the node writes it, of the time and boot of FakeClock."""
+    """A status as the node writes it, with the time and boot of FakeClock."""
     root.mkdir(exist_ok=True)
     head = {'robot': 'thor', 'pid': os.getpid(), 'boot_id': 'a-boot', 'boot_ns': NOON_NS, 'uptime_s': 12.0, 'ended': False}
     file(root, changes.get('robot', 'thor')).write_text(json.dumps({**head, 'spool': {'max_bytes': 1000}, **changes}))
@@ -35,7 +35,7 @@ def written(root: Path, **changes: Any) -> None:
 
 @pytest.fixture(scope='module')
 def child() -> Iterator[int]:
-    """The id of a process that is there."""
+    """The id of a running process."""
     with subprocess.Popen([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE) as process:
         yield process.pid
         process.communicate(b'\n')
@@ -46,7 +46,7 @@ def state(root: Path, now_ns: int = NOON_NS) -> str:
 
 
 def test_a_fresh_status_means_a_running_node(tmp_path: Path) -> None:
-    """Younger than five seconds by the boot clock, whatever the wall clock says; its figures are handed on as they are."""
+    """Younger than five seconds by the boot clock, whatever the wall clock shows; its values are reported unchanged."""
     written(tmp_path, topics={'/imu': {'received': 7}}, time='1970-01-01T00:00:00Z')
     found = read(tmp_path, 'thor', FakeClock(NOON_NS + 4 * SECOND))
     assert (found.state, found.running, found.age_s) == ('running', True, 4.0)
@@ -58,7 +58,7 @@ def test_a_fresh_status_means_a_running_node(tmp_path: Path) -> None:
     'changes', [{'boot_id': 'another'}, {'ended': True}, {'pid': 2**22 + 1, 'boot_ns': NOON_NS - 6 * SECOND}]
 )
 def test_an_exited_node_is_not_running(tmp_path: Path, changes: dict[str, Any]) -> None:
-    """Of another boot, of a clean end, or old and of a process that is gone: not running, and its figures are not shown."""
+    """From another boot, stopped cleanly, or old with a process that is gone: not running, and its values are not shown."""
     written(tmp_path, topics={'/imu': {}}, **changes)
     found = read(tmp_path, 'thor', FakeClock())
     assert (found.state, found.running) == ('not_running', False)
@@ -67,7 +67,7 @@ def test_an_exited_node_is_not_running(tmp_path: Path, changes: dict[str, Any]) 
 
 
 def test_a_silent_process_is_not_answering(tmp_path: Path, child: int) -> None:
-    """It was there when the status was written and still is, but wrote nothing for five seconds."""
+    """The process was there when the status was written and still is, but wrote nothing for five seconds."""
     clock = SystemClock.of_this_machine()
     written(tmp_path, pid=child, boot_id=clock.boot_id, boot_ns=clock.boot_ns())
     found = read(tmp_path, 'thor', Ahead(clock.boot_id))
@@ -76,7 +76,7 @@ def test_a_silent_process_is_not_answering(tmp_path: Path, child: int) -> None:
 
 
 def test_a_later_process_of_the_same_number_is_not_the_node(tmp_path: Path, child: int) -> None:
-    """Process ids are given out again: one that began after the status was written did not write it."""
+    """Process ids are reused: a process that started after the status was written did not write it."""
     clock = SystemClock.of_this_machine()
     written(tmp_path, pid=child, boot_id=clock.boot_id, boot_ns=clock.boot_ns() - 3600 * SECOND)
     assert read(tmp_path, 'thor', clock).state == 'not_running'
@@ -107,7 +107,7 @@ class Ahead(SystemClock):
     ],
 )
 def test_a_damaged_file_is_a_finding(tmp_path: Path, content: str) -> None:
-    """A power cut may damage a file that is never synced; another version may write other types. No reader fails."""
+    """A power cut may damage a file that is never synced; another version may write other types. Readers do not fail."""
     path = file(tmp_path, 'thor')
     path.write_text(content)
     found = read(tmp_path, 'thor', FakeClock())
@@ -117,14 +117,14 @@ def test_a_damaged_file_is_a_finding(tmp_path: Path, content: str) -> None:
 
 
 def test_fields_of_a_newer_node_are_ignored(tmp_path: Path) -> None:
-    """At the top, in a section and in a topic; all other figures are read."""
+    """At the top, in a section and in a topic; all other values are read."""
     written(tmp_path, mood='good', store={'mood': 1, 'delivered': 5}, topics={'/imu': {'mood': [], 'received': 7}})
     found = read(tmp_path, 'thor', FakeClock()).node
     assert (found.store.delivered, found.topics['/imu'].received) == (5, 7)
 
 
 def test_fields_of_other_versions_have_defaults(tmp_path: Path) -> None:
-    """A program that is newer than the node that runs can still show its status."""
+    """A program newer than the running node can still show its status."""
     written(tmp_path, topics={'/imu': {}}, workers={'intake': {}})
     found = read(tmp_path, 'thor', FakeClock())
     assert found.node.topics['/imu'].missed is None
@@ -133,7 +133,7 @@ def test_fields_of_other_versions_have_defaults(tmp_path: Path) -> None:
 
 
 def test_without_a_node_the_index_is_read(tmp_path: Path) -> None:
-    """What lies in the spool, how old the oldest object is, and when the last session began and ended."""
+    """The contents of the spool, the age of the oldest object, and when the last session started and ended."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
     spool.open()
@@ -154,7 +154,7 @@ def test_without_a_node_the_index_is_read(tmp_path: Path) -> None:
 
 
 def test_a_killed_session_has_no_end(tmp_path: Path) -> None:
-    """A node that was killed leaves a session without an end, and nothing of it is taken for one."""
+    """A killed node has a session without an end, and no other time is used instead."""
     spool = new_spool(tmp_path / 'spool')
     spool.open()
     found = read(tmp_path / 'spool', 'thor', FakeClock())
@@ -163,7 +163,7 @@ def test_a_killed_session_has_no_end(tmp_path: Path) -> None:
 
 
 def test_the_session_is_that_of_the_node(tmp_path: Path) -> None:
-    """Not of whoever sent a mission or a bag from the same spool meanwhile."""
+    """Not that of another process that has sent a mission or a bag from the same spool."""
     for clock in (FakeClock(), FakeClock(NOON_NS + 60 * SECOND)):
         spool = new_spool(tmp_path, clock)
         spool.open()
@@ -178,7 +178,7 @@ def test_the_session_is_that_of_the_node(tmp_path: Path) -> None:
 
 
 def test_a_missing_and_a_damaged_spool_are_reported(tmp_path: Path) -> None:
-    """Both are told among the findings, and leave the spool unknown."""
+    """Both are findings, and the contents of the spool are unknown."""
     found = read(tmp_path, 'thor', FakeClock())
     assert found.spool is None
     assert any(str(tmp_path) in line for line in found.findings)
@@ -236,20 +236,19 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
     ],
 )
 def test_each_fault_of_a_running_node_is_a_finding(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:
-    """Each loss and each fault of a running node is a finding."""
     written(tmp_path, **changes)
     assert finding in read(tmp_path, 'thor', FakeClock()).findings
 
 
 @pytest.mark.parametrize('name', ['idle', 'shipping', 'not_draining'])
 def test_a_working_store_is_not_a_finding(tmp_path: Path, name: str) -> None:
-    """Nor is one that another process delivers to, nor what lies in quarantine from before."""
+    """Neither is one that another process delivers to, nor files already in quarantine."""
     written(tmp_path, store={'state': name}, spool={'quarantined': 5}, topics={'/imu': {'skipped': 9, 'open': 3}})
     assert read(tmp_path, 'thor', FakeClock()).findings == ()
 
 
 def test_the_robots_of_a_spool_are_listed(tmp_path: Path) -> None:
-    """Known by their files; other files are nobody's."""
+    """From their status files; other files are ignored."""
     written(tmp_path, robot='thor')
     written(tmp_path, robot='robot_1.a')
     (tmp_path / 'status.json').touch()
@@ -258,13 +257,13 @@ def test_the_robots_of_a_spool_are_listed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('gave_up', 'words'), [(False, 'objects wait for their date'), (True, 'objects go without a date')])
 def test_a_clock_that_is_not_set_is_a_finding(tmp_path: Path, words: str, *, gave_up: bool) -> None:
-    """And so is what that means for the objects."""
+    """And so are its consequences for the objects."""
     written(tmp_path, clock={'is_set': False, 'gave_up': gave_up})
     assert f'the clock of this machine is not set: {words}' in read(tmp_path, 'thor', FakeClock()).findings
 
 
 def test_an_unknown_age_is_unknown(tmp_path: Path) -> None:
-    """What was spooled before the clock was set has not waited since 1970."""
+    """An object spooled before the clock was set has not waited since 1970."""
     clock = FakeClock(60 * SECOND)
     spool = new_spool(tmp_path, clock)
     spool.open()
@@ -277,7 +276,7 @@ def test_an_unknown_age_is_unknown(tmp_path: Path) -> None:
 
 
 def test_other_processes_use_the_limits_of_the_node(tmp_path: Path) -> None:
-    """The widest of several nodes' limits; where none has run, or an old one did not say, those of one's own."""
+    """The highest of several nodes' limits; if none has run, or an old one reported none, the process's limits."""
     assert limits(tmp_path, OWN) == OWN
     written(tmp_path, spool={'max_bytes': 9 << 20})
     assert limits(tmp_path, OWN) == SpoolSettings(max_bytes=9 << 20, min_free_bytes=10)

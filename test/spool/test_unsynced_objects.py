@@ -26,7 +26,7 @@ FINAL = 'thor/camera/20251018/120000_front.jpg'
 
 
 class Run:
-    """A process of the node, as far as dates go."""
+    """A process of the node, limited to dating objects."""
 
     def __init__(self, root: Path, clocks: Clocks, hold_s: float = 600.0) -> None:
         self.record = ClockRecord(root, 'thor')
@@ -37,7 +37,7 @@ class Run:
         self.clocks = clocks
 
     def take(self, *fields: dict[str, Any]) -> list[SpooledObject]:
-        """Objects whose messages were sent now, as the encoders make them."""
+        """Objects with messages sent now, as the encoders create them."""
         items = [self.made(**each) for each in fields or ({},)]
         receive(self.spool, len(items))
         return self.spool.commit([self.unsynced.mark(item) for item in items])
@@ -51,7 +51,7 @@ class Run:
 
 @pytest.fixture
 def clocks() -> Clocks:
-    """They are not set."""
+    """Clocks that are not set."""
     return Clocks()
 
 
@@ -77,7 +77,7 @@ def said(root: Path) -> list[dict[str, Any]]:
 
 
 def test_an_object_of_a_set_clock_is_not_held(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
-    """It keeps its key and its date, and says when it was by the boot clock."""
+    """It keeps its key and its date, and records its time by the boot clock."""
     clocks.set()
     (item,) = started().take({'key': FINAL})
     expected = {'boot_id': 'this-boot', 'boot_start_ns': str(60 * SECOND), 'boot_end_ns': str(60 * SECOND + 1), 'clock': 'set'}
@@ -87,7 +87,7 @@ def test_an_object_of_a_set_clock_is_not_held(started: Callable[..., Run], root:
 
 
 def test_an_object_waits_for_the_clock(started: Callable[..., Run], root: Path) -> None:
-    """Held, under a name by the boot clock, and nothing of it says 1970."""
+    """It is held, under a name by the boot clock, and nothing in it is dated 1970."""
     run = started()
     assert run.take() == []
     assert run.unsynced.step() == []
@@ -104,7 +104,7 @@ def test_an_object_waits_for_the_clock(started: Callable[..., Run], root: Path) 
 def test_an_object_is_dated_when_the_clock_is_set(
     started: Callable[..., Run], root: Path, clocks: Clocks, *, restart: bool
 ) -> None:
-    """Key, times and metadata are those of UTC, also in a later process of the same boot; its bytes are what they were."""
+    """Key, times and metadata are in UTC, also in a later process of the same boot; its bytes are unchanged."""
     run = started()
     run.take({'body': b'one'}, {'body': b'two'})
     run = started() if restart else run
@@ -124,7 +124,7 @@ def test_an_object_is_dated_when_the_clock_is_set(
 
 
 def test_objects_encoded_after_the_clock_was_set_are_dated_immediately(started: Callable[..., Run], clocks: Clocks) -> None:
-    """A batch of before, encoded after: it is never held."""
+    """A batch from before that is encoded after is never held."""
     run = started()
     item = run.made()
     clocks.set()
@@ -133,7 +133,7 @@ def test_objects_encoded_after_the_clock_was_set_are_dated_immediately(started: 
 
 
 def test_the_time_of_a_publisher_with_a_set_clock_is_used(started: Callable[..., Run], clocks: Clocks) -> None:
-    """Its object goes under its date at once, though our clock is not set; by the boot clock it was just now."""
+    """Its object is dated immediately, though our clock is not set; by the boot clock it was just now."""
     run = started()
     item = run.made(FINAL, t_start_ns=NOON_NS, t_end_ns=NOON_NS + SECOND)
     dated = run.unsynced.mark(item)
@@ -143,7 +143,7 @@ def test_the_time_of_a_publisher_with_a_set_clock_is_used(started: Callable[...,
 
 
 def test_after_ten_minutes_objects_are_sent_without_a_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
-    """What is held and what comes after keep the names by the boot clock, and say that they have no date."""
+    """Objects that are held and those after them keep their names by the boot clock, and record that they have no date."""
     run = started()
     run.take()
     clocks.wait(601)
@@ -157,7 +157,7 @@ def test_after_ten_minutes_objects_are_sent_without_a_date(started: Callable[...
 
 
 def test_objects_of_an_earlier_boot_are_sent_without_a_date(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
-    """Its clock never was set: no later one can date it, and it goes at once, whatever the clock of now is."""
+    """Its clock was never set: no later clock can date it, and it is released immediately, whatever the clock shows now."""
     started().take()
     clocks.boot_id, clocks.up_ns = 'next-boot', 20 * SECOND
     run = started()
@@ -168,7 +168,7 @@ def test_objects_of_an_earlier_boot_are_sent_without_a_date(started: Callable[..
 
 
 def test_objects_of_an_earlier_boot_are_dated_by_its_offset(started: Callable[..., Run], clocks: Clocks) -> None:
-    """A process that ended before it could name them left the offset of its boot."""
+    """A process that ended before it could name them recorded the offset of its boot."""
     run = started()
     run.take()
     clocks.set()
@@ -178,7 +178,7 @@ def test_objects_of_an_earlier_boot_are_dated_by_its_offset(started: Callable[..
 
 
 def test_dates_survive_the_loss_of_the_index(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
-    """What is needed for it lies with the file."""
+    """The data needed for it is stored with the file."""
     run = started()
     run.take()
     run.spool.close()
@@ -193,7 +193,7 @@ def test_dates_survive_the_loss_of_the_index(started: Callable[..., Run], root: 
 
 @pytest.mark.parametrize('pattern', ['../{date}/{time}', 'thor/{date}', '', 'a' * 300])
 def test_a_changed_key_pattern_does_not_stop_the_others(started: Callable[..., Run], pattern: str, clocks: Clocks) -> None:
-    """A name that cannot be one does not stop the others: it goes without a date, or under what is left of its pattern."""
+    """An object with an invalid name does not block others: it is sent without a date, or under the valid part of its pattern."""
     run = started()
     run.take({}, {'key_pattern': 'x'})
     one = run.spool.reading.objects.held('clock')[0]
@@ -216,7 +216,7 @@ def test_many_objects_are_named_in_steps(started: Callable[..., Run], clocks: Cl
 
 
 def test_the_ledger_names_the_state(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
-    """Whether the clock is set, how often it stepped in all processes, and what waits for it."""
+    """Whether the clock is set, how often it stepped in all processes, and which objects wait for it."""
     run = started()
     run.take()
     run.unsynced.step()
@@ -234,7 +234,7 @@ def test_the_ledger_names_the_state(started: Callable[..., Run], root: Path, clo
 
 @pytest.mark.parametrize('content', [b'', b'{}', b'[]', b'{"offsets": [], "is_set": 1, "steps": "x"}', b'\xff'])
 def test_an_unreadable_record_is_ignored(started: Callable[..., Run], root: Path, content: bytes, clocks: Clocks) -> None:
-    """It begins anew; nothing else depends on it."""
+    """A new record is started; nothing depends on the old one."""
     run = started()
     file(root, 'thor').write_bytes(content)
     run = started()
@@ -246,7 +246,7 @@ def test_an_unreadable_record_is_ignored(started: Callable[..., Run], root: Path
 
 def test_a_record_that_cannot_be_written_stops_nothing(started: Callable[..., Run], root: Path, clocks: Clocks,
                                          caplog: pytest.LogCaptureFixture) -> None:  # fmt: skip
-    """Dates are given all the same."""
+    """Objects are dated anyway."""
     run = started()
     run.take()
     file(root, 'thor').with_name('clock-thor.json.part').mkdir()
@@ -270,7 +270,7 @@ def test_a_record_keeps_few_boots(root: Path, clocks: Clocks) -> None:
 
 
 def test_a_held_object_with_a_date_is_released(started: Callable[..., Run], root: Path, clocks: Clocks) -> None:
-    """Whatever made it, it does not wait for ever: it goes as it is once the clock is set."""
+    """It does not wait indefinitely: it is released unchanged once the clock is set."""
     run = started()
     run.take()
     run.spool._connections.writing._db.execute('UPDATE objects SET t_start_ns = ?', (NOON_NS,))

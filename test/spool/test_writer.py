@@ -1,4 +1,4 @@
-"""The spool writer: what was put becomes durable in few commits, and a disk that fails delays but loses nothing."""
+"""The spool writer: objects become durable in few commits, and a failing disk delays them but loses nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from shadowhound_data_logger.spool.writer import MANY_OUTCOMES, MAX_BYTES, Spool
 
 @pytest.fixture
 def commits(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many objects each commit had that had any."""
+    """The number of objects in each commit that had any."""
     counts: list[int] = []
     commit = spool.commit
 
@@ -59,7 +59,7 @@ def opened(spool: Spool) -> Iterator[Callable[..., SpoolWriter]]:
 
 
 def test_objects_are_durable_after_a_flush(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
-    """A flush returns when all objects put before it are in the spool, and tells the uploader of them."""
+    """A flush returns when all objects put before it are in the spool, and notifies the uploader of them."""
     told: list[SpooledObject] = []
     writing = opened(60.0, spooled=told.extend)
     for number in range(20):
@@ -72,7 +72,7 @@ def test_objects_are_durable_after_a_flush(opened: Callable[..., SpoolWriter], s
 
 
 def test_a_burst_is_one_commit(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:
-    """The first object after a quiet time waits for those that are in the making, and no longer."""
+    """The first object after a quiet time waits for those being created, and no longer."""
     in_the_making = [True]
     writing = opened(600.0, expects=lambda: bool(in_the_making))
     for number in range(5):
@@ -84,7 +84,7 @@ def test_a_burst_is_one_commit(opened: Callable[..., SpoolWriter], commits: list
 
 
 def test_a_burst_without_end_is_committed_anyway(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:
-    """Even if more objects are always being made."""
+    """Even if there are always more objects being created."""
     writing = opened(0.1, expects=lambda: True)
     writing.put(make('first', topic=None))
     until(lambda: bool(commits))
@@ -92,7 +92,7 @@ def test_a_burst_without_end_is_committed_anyway(opened: Callable[..., SpoolWrit
 
 
 def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool, commits: list[int]) -> None:
-    """After the first commit the others wait for the next one, which takes all of them."""
+    """After the first commit the others wait for the next one, which includes all of them."""
     writing = opened(60.0)
     writing.put(make('first', topic=None))
     assert writing.flush(60)
@@ -105,7 +105,7 @@ def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool,
 
 
 def test_kept_objects_wait_for_others_to_commit(opened: Callable[..., SpoolWriter], root: Path, commits: list[int]) -> None:
-    """It is committed with the next object that does not, or by itself after a heartbeat, or once it is much."""
+    """It is committed with the next object that may not wait, or after a heartbeat, or once there are many bytes."""
     kept: dict[str, Any] = {'topic': None, 'metadata': {meta.SHIP: meta.ON_REQUEST}}
     writing = opened(0.0)
     for number in range(5):
@@ -113,21 +113,21 @@ def test_kept_objects_wait_for_others_to_commit(opened: Callable[..., SpoolWrite
     writing.put(make('sent', topic=None))
     assert writing.flush(60)
     assert sum(commits) == 6
-    assert len(commits) <= 2  # the heartbeat may come between
+    assert len(commits) <= 2  # the heartbeat may be in between
     writing.put(make('alone', **kept))
     until(lambda: sum(commits) == 7)
     writing.put(make('large', bytes(MAX_BYTES), **kept))
     until(lambda: sum(commits) == 8)
     assert writing.flush(60)
     found = assert_whole(root)['objects']
-    assert (found['kept'] + found['evicted'], found['pending']) == (7, 1)  # the limit of what is kept is small
+    assert (found['kept'] + found['evicted'], found['pending']) == (7, 1)  # the limit for waiting objects is small
 
 
 @pytest.mark.parametrize(('count', 'size'), [(200, 10), (20, 1 << 20)])
 def test_a_burst_does_not_lock_the_index(
     opened: Callable[..., SpoolWriter], spool: Spool, root: Path, commits: list[int], count: int, size: int
 ) -> None:
-    """What comes at once is committed in parts, in its order: between them other processes get their turn."""
+    """Objects that arrive together are committed in several parts, in order; other processes run in between."""
     writing = opened(60.0)
     writing.put(make('first', topic=None))
     assert writing.flush(60)
@@ -151,7 +151,7 @@ def test_outcomes_wait_for_an_object(
     count: int,
     commits_alone: bool,
 ) -> None:
-    """A few outcomes share the next object's commit, unless somebody waits for them; many have one of their own."""
+    """A few outcomes share the next object's commit, unless a caller waits for them; many get a separate one."""
     monkeypatch.setattr(writer_module, 'HEARTBEAT_S', 60.0)
     items = spool.commit([make(f'{number}', topic=None) for number in range(count)])
     settled = threading.Event()
@@ -165,7 +165,7 @@ def test_outcomes_wait_for_an_object(
 
 def test_a_thread_that_fails_in_a_commit_loses_nothing(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
                                         monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """All that was to be committed is committed by the next round, once."""
+    """Everything pending is committed by the next round, once."""
     monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
     deaths, commit = [SystemExit(1), MemoryError()], spool.commit
 
@@ -184,7 +184,7 @@ def test_a_thread_that_fails_in_a_commit_loses_nothing(opened: Callable[..., Spo
 
 
 def test_outcomes_are_durable_before_they_are_reported(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
-    """The uploader hears of a settled object only when its outcome is in the index."""
+    """The uploader is notified of a settled object only when its outcome is in the index."""
     settled: list[int] = []
     states: list[str] = []
 
@@ -202,7 +202,7 @@ def test_outcomes_are_durable_before_they_are_reported(opened: Callable[..., Spo
 
 def test_a_failing_disk_loses_nothing(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
                                       monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """A commit that fails is tried again with all that was in it, until the disk works."""
+    """A failed commit is retried with all its objects until the disk works."""
     monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
     commit, failures = spool.commit, threading.Semaphore(3)
 
@@ -226,7 +226,7 @@ DiskOf = Callable[[int], Path]
 
 @pytest.fixture
 def disk_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DiskOf:
-    """Makes the spool's disk one of so many bytes; beside the spool it has a folder for files that are to be taken in."""
+    """Limits the spool's disk to this many bytes; next to the spool it has a folder for files to add."""
     beside, write_body = tmp_path / 'beside', Tree.write_body
     beside.mkdir()
 
@@ -250,7 +250,7 @@ def disk_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DiskOf:
 def test_removing_files_does_not_delay_a_commit(
     opened: Callable[..., SpoolWriter], spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What comes while they are removed is durable before all of them are gone; at the end they are."""
+    """Objects that arrive during the removal are durable before all files are removed; at the end they are."""
     items = spool.commit([make(f'{number}', topic=None) for number in range(20)])
     remove, pending_then = spool.remove_files, list[int]()
 
@@ -274,7 +274,7 @@ def test_removing_files_does_not_delay_a_commit(
 def test_files_are_removed_while_outcomes_are_settled(
     opened: Callable[..., SpoolWriter], spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of what was settled before, so that the writer's thread can commit."""
+    """Those settled earlier, so that the writer's thread can commit."""
     items = spool.commit([make(f'{number}', topic=None) for number in range(5)])
     commit, remove = spool.commit, spool.remove_files
     may_commit, is_committing, removed_by = threading.Event(), threading.Event(), list[int]()
@@ -310,7 +310,7 @@ def test_files_are_removed_while_outcomes_are_settled(
 def test_delivered_files_are_removed_before_anything_is_evicted(
     root: Path, disk_of: DiskOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the disk is short by ``spool.min_free_bytes`` alone, and what was delivered had a commit of its own."""
+    """Also if the disk is short by ``spool.min_free_bytes`` alone, and the deliveries had a separate commit."""
     body = bytes(200_000)
     cost = len(body) + OVERHEAD_BYTES
     disk_of(100 * cost)
@@ -343,7 +343,7 @@ def test_delivered_files_are_removed_before_anything_is_evicted(
 
 def test_delivered_files_are_removed_first_on_a_full_disk(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
                                                      disk_of: DiskOf) -> None:  # fmt: skip
-    """A disk that is full of what was delivered has room for as much again: the spool does not wait for it for ever."""
+    """A disk full of delivered files has room for the same amount again: the spool does not wait for it indefinitely."""
     body = bytes(200_000)
     disk_of(5 * (len(body) + OVERHEAD_BYTES))
     writing = opened(60.0)
@@ -363,7 +363,7 @@ def test_delivered_files_are_removed_first_on_a_full_disk(opened: Callable[..., 
 
 def test_files_of_a_full_disk_make_room_for_the_rest(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
                                                      disk_of: DiskOf) -> None:  # fmt: skip
-    """Slices that wait for the same commit are given up, or taken as they lie, before anything is written in their place."""
+    """Slices waiting for the same commit are given up, or linked, before anything is written in their place."""
     body = bytes(200_000)
     disk = disk_of(7 * (len(body) + OVERHEAD_BYTES))
     writing = opened(60.0)
@@ -387,7 +387,7 @@ def test_files_of_a_full_disk_make_room_for_the_rest(opened: Callable[..., Spool
 
 def test_encoders_wait_while_the_queue_is_full(opened: Callable[..., SpoolWriter], spool: Spool,
                                             monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """With the disk hung, put blocks once the bytes are too many, and goes on when the disk does."""
+    """With the disk hung, put blocks once there are too many bytes, and continues when the disk does."""
     monkeypatch.setattr(writer_module, 'MAX_WAITING_BYTES', 10)
     commit, hung = spool.commit, threading.Event()
 
@@ -411,7 +411,7 @@ def test_encoders_wait_while_the_queue_is_full(opened: Callable[..., SpoolWriter
 
 
 def test_an_invalid_key_is_refused_immediately(opened: Callable[..., SpoolWriter]) -> None:
-    """It is the caller's error, and does not stop the commits of others."""
+    """It is an error of the caller, and does not stop the commits of others."""
     writing = opened()
     with pytest.raises(NameRefused):
         writing.put(make('../etc/passwd', topic=None))
@@ -421,7 +421,7 @@ def test_an_invalid_key_is_refused_immediately(opened: Callable[..., SpoolWriter
 
 def test_the_accounts_become_durable_without_objects(opened: Callable[..., SpoolWriter], spool: Spool, root: Path,
                                                      monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """A topic of which nothing is kept is in the ledger all the same, within a heartbeat."""
+    """A topic with only skipped messages is in the ledger within a heartbeat."""
     monkeypatch.setattr(writer_module, 'HEARTBEAT_S', 0.01)
     with spool.accounts.entry('/camera') as account:
         account.receive('p', 1)

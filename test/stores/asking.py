@@ -18,7 +18,7 @@ def settings_for(url: str) -> StoreSettings:
 
 
 def error_of(kind: type[DataLoggerError], ask: Callable[[], object], secret: str = SECRET) -> str:
-    """The error's sentence, once it is certain that nothing of it holds the secret."""
+    """The message of the error, after a check that the secret is not in it."""
     with pytest.raises(kind) as caught:
         ask()
     assert type(caught.value) is kind

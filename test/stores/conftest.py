@@ -31,14 +31,14 @@ def bucket() -> str:
 
 @pytest.fixture
 def spool(tmp_path: Path, bucket: str) -> Spool:
-    """Makes spooled objects, for ``bucket`` unless told otherwise."""
+    """Makes spooled objects, for ``bucket`` by default."""
     return Spool(tmp_path, bucket)
 
 
 @pytest.fixture(scope='session')
 def moto() -> Iterator[StoreSettings]:
     """A moto server, over real HTTP."""
-    from moto.server import ThreadedMotoServer  # takes half a second, which those who only collect do not need
+    from moto.server import ThreadedMotoServer  # takes half a second, not needed to collect tests
 
     server = ThreadedMotoServer(ip_address='127.0.0.1', port=0, verbose=False)
     server.start()
@@ -49,7 +49,7 @@ def moto() -> Iterator[StoreSettings]:
 
 @pytest.fixture(scope='module')
 def owner(seaweed: Tower) -> Iterator[S3Store]:
-    """Who may delete buckets."""
+    """A client that may delete buckets."""
     with closing(S3Store(seaweed.store_settings(), QUICK)) as opened:
         opened.open()
         yield opened
@@ -57,7 +57,7 @@ def owner(seaweed: Tower) -> Iterator[S3Store]:
 
 @pytest.fixture(params=STORES)
 def store(request: pytest.FixtureRequest, tmp_path: Path, bucket: str) -> Iterator[ObjectStore]:
-    """Each store, open."""
+    """An open store of each kind."""
     if request.param in {'seaweed', 'obstore'}:
         owner: S3Store = request.getfixturevalue('owner')
     opened: ObjectStore = MemoryStore()
@@ -73,7 +73,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path, bucket: str) -> Iterat
         opened = open_reader(tower.store_settings())
     yield opened
     opened.close()
-    if request.param in {'seaweed', 'obstore'}:  # a server has room for so many buckets
+    if request.param in {'seaweed', 'obstore'}:  # a server has room for a limited number of buckets
         with suppress(ClientError):
             owner._client._client.delete_bucket(Bucket=bucket)
 

@@ -1,4 +1,4 @@
-"""A small S3 look-alike over HTTP whose faults are set by hand, and sockets that behave badly."""
+"""A small imitation of S3 over HTTP with faults set by the test, and sockets that misbehave."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from urllib.parse import unquote, urlsplit
 
 
 class FakeS3(ThreadingHTTPServer):
-    """Holds objects; ``condition`` is what it does with If-None-Match; an ``answer`` is given to everything."""
+    """Stores objects; ``condition`` selects its behavior for If-None-Match; an ``answer`` is the response to every request."""
 
     daemon_threads = True
 
@@ -25,12 +25,12 @@ class FakeS3(ThreadingHTTPServer):
         self.answer = answer
         self.without_buckets = without_buckets
         self.creations = 0
-        """How often a bucket was to be created, which is denied where there are to be none."""
+        """The number of attempts to create a bucket, which is denied if it may have none."""
         self.lock = threading.Lock()
-        """Makes a look and a put one step, where nobody is to win a race."""
+        """Makes the check and the put atomic, unless a race is intended."""
         self.forbid_head = False
         self.races: dict[str, threading.Barrier] = {}
-        """Key -> so many creates of it see that nothing is there, before any of them writes, and all write before any answers."""
+        """Key -> this many creates of it find no object before any of them writes, and all write before any responds."""
         self.objects: dict[str, tuple[bytes, dict[str, str]]] = {}
         self.requests: list[str] = []
         """Methods, in order."""
@@ -41,7 +41,7 @@ class FakeS3(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers as S3 does."""
+    """Responds as S3 does."""
 
     """Answers as S3 does."""
 
@@ -148,14 +148,14 @@ def served(server: FakeS3) -> Iterator[FakeS3]:
 
 @contextmanager
 def hung() -> Iterator[str]:
-    """A server that takes connections and never answers."""
+    """A server that accepts connections and never responds."""
     with socket.create_server(('127.0.0.1', 0)) as listening:
         yield f'http://127.0.0.1:{listening.getsockname()[1]}'
 
 
 @contextmanager
 def refused() -> Iterator[str]:
-    """A port on which nobody listens, and nobody else can begin to."""
+    """A port without a listener that no other process can bind."""
     with socket.socket() as bound:
         bound.bind(('127.0.0.1', 0))
         yield f'http://127.0.0.1:{bound.getsockname()[1]}'
@@ -163,7 +163,7 @@ def refused() -> Iterator[str]:
 
 @contextmanager
 def resetting(answer: bytes, *, reset: bool = True) -> Iterator[str]:
-    """A server that resets, or just ends, every connection after the first bytes of an answer."""
+    """A server that resets, or just closes, every connection after the first bytes of a response."""
     listening = socket.create_server(('127.0.0.1', 0))
 
     def serve() -> None:
@@ -172,7 +172,7 @@ def resetting(answer: bytes, *, reset: bool = True) -> Iterator[str]:
                 connection, _ = listening.accept()
             except OSError:
                 return
-            with connection, suppress(ConnectionError):  # whoever asked may have had enough of it
+            with connection, suppress(ConnectionError):  # the client may have given up
                 connection.recv(65536)
                 connection.sendall(answer)
                 if reset:

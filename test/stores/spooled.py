@@ -16,16 +16,16 @@ from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.model import SpooledObject
 
 MOTO = pytest.param('moto', marks=pytest.mark.long('a second S3 server, a slow one'))
-"""The request for moto beside SeaweedFS."""
+"""The request for moto in addition to SeaweedFS."""
 QUICK = UploadSettings(threads=8, connect_timeout_s=2.0, read_timeout_s=20.0)
 
 
 BUSY_S = 30.0
-"""More than enough for SeaweedFS to find room for a new bucket on a busy machine; it answers 500 meanwhile."""
+"""Enough time for SeaweedFS to allocate a new bucket on a busy machine; it responds with 500 until then."""
 
 
 def with_room(ask: Callable[[], Any]) -> Any:
-    """What is asked first of a new bucket of SeaweedFS: again while the server answers 500."""
+    """Send the first request to a new bucket of SeaweedFS: again while the server responds with 500."""
     end = time.monotonic() + BUSY_S
     while True:
         try:
@@ -37,7 +37,7 @@ def with_room(ask: Callable[[], Any]) -> Any:
 
 
 class Spool:
-    """Makes spooled objects whose files lie in one folder."""
+    """Makes spooled objects with files in one folder."""
 
     def __init__(self, folder: Path, bucket: str) -> None:
         self._folder = folder
@@ -48,7 +48,7 @@ class Spool:
         self, key: str, content: bytes, *, bucket: str = '', content_type: str = 'image/jpeg',
         metadata: Mapping[str, str] | None = None,
     ) -> SpooledObject:  # fmt: skip
-        """A file with this content, and what the index would know of it."""
+        """A file with this content, and its index entry."""
         number = next(self._numbers)
         path = self._folder / f'spooled-{number}'
         path.write_bytes(content)

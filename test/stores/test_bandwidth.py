@@ -1,4 +1,4 @@
-"""The cap: how fast pieces leave, and whose."""
+"""The cap: how fast pieces are sent, and in which order."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from shipping.fakes import until
 from shadowhound_data_logger.stores.bandwidth import BYTES_PER_MEGABIT, LARGEST_PIECE, LATE_S, Pace
 
 QUICK_S = 60.0
-"""What happens at once takes much less, what does not takes more."""
+"""Immediate operations take much less, delayed ones more."""
 
 
 class Sender(threading.Thread):
-    """Takes a body to its end, or until it is given up."""
+    """Reads a body to its end, or until it is cancelled."""
 
     def __init__(self, pieces: Iterator[bytes], log: list[str], name: str = '') -> None:
         super().__init__(name=name, daemon=True)
@@ -34,7 +34,7 @@ class Sender(threading.Thread):
 
 
 def test_without_a_limit_a_body_is_sent_in_large_pieces() -> None:
-    """Nothing of it is changed, and it is counted."""
+    """It is unchanged, and counted."""
     pace, body = Pace(), bytes(range(256)) * 1000
     pieces = list(pace.pieces(body, 5))
     assert b''.join(pieces) == body
@@ -50,7 +50,7 @@ def test_a_file_is_sent_completely_from_any_position() -> None:
 
 
 def test_a_limited_body_is_sent_evenly() -> None:
-    """In no span of time more than the cap allows for it, but for one piece and what a thread that woke late catches up."""
+    """In any interval at most what the cap allows, except for one piece and what a thread that woke up late catches up."""
     pace = Pace(4.0)
     rate = 4.0 * BYTES_PER_MEGABIT
     left = [(time.monotonic(), len(piece)) for piece in pace.pieces(bytes(200_000), 5)]
@@ -66,7 +66,7 @@ def test_a_limited_body_is_sent_evenly() -> None:
 
 
 def test_a_cap_holds_for_all_bodies_together() -> None:
-    """Four at a time take as long as one after the other."""
+    """Four at the same time take as long as one after the other."""
     pace = Pace(8.0)
     senders = [Sender(pace.pieces(bytes(100_000), 5), []) for _ in range(4)]
     began = time.monotonic()
@@ -79,7 +79,7 @@ def test_a_cap_holds_for_all_bodies_together() -> None:
 
 
 def test_priority_decides_without_starvation() -> None:
-    """While it leaves, the others together get about each fourth piece: no less, or their servers would give them up."""
+    """While it is sent, the others together get about every fourth piece: with less, their servers would time out."""
     pace, log = Pace(4.0), list[str]()
     others = [Sender(pace.pieces(bytes(2_000_000), 9), log, 'other') for _ in range(3)]
     for other in others:
@@ -97,7 +97,7 @@ def test_priority_decides_without_starvation() -> None:
 
 
 def test_a_yielding_body_is_sent_after_its_equals() -> None:
-    """A part of a slice that was there first gets no more beside a live object than each fourth piece."""
+    """A part of a slice that started earlier gets only every fourth piece while a live object is sent."""
     pace, log = Pace(4.0), list[str]()
     part = Sender(pace.pieces(bytes(2_000_000), 5, is_background=True), log, 'part')
     part.start()
@@ -112,7 +112,7 @@ def test_a_yielding_body_is_sent_after_its_equals() -> None:
 
 
 def test_of_equal_bodies_the_first_is_finished_first() -> None:
-    """Sharing would make all of them late."""
+    """Sharing would delay all of them."""
     pace, log = Pace(4.0), list[str]()
     first, second = (Sender(pace.pieces(bytes(150_000), 5), log, name) for name in ('first', 'second'))
     first.start()
@@ -124,7 +124,7 @@ def test_of_equal_bodies_the_first_is_finished_first() -> None:
 
 
 def test_a_new_limit_applies_immediately() -> None:
-    """For a body that waits under the old one, too."""
+    """Also for a body that waits because of the old one."""
     pace = Pace(0.001)
     sender = Sender(pace.pieces(bytes(100_000), 5), [])
     sender.start()
@@ -136,7 +136,7 @@ def test_a_new_limit_applies_immediately() -> None:
 
 
 def test_cancelled_bodies_end_immediately() -> None:
-    """A stop does not wait for the cap; another drain of the same store is none of its business."""
+    """A stop does not wait for the cap; another drain of the same store is not affected."""
     pace = Pace(0.001)
     senders = [Sender(pace.pieces(bytes(100_000), 5), []) for _ in range(3)]
     for sender in senders:
@@ -151,7 +151,7 @@ def test_cancelled_bodies_end_immediately() -> None:
 
 
 def test_recent_throughput_is_measured() -> None:
-    """Whoever plans with it gets a number in any case."""
+    """There is always a number."""
     pace = Pace()
     assert pace.bytes_in(0.5) == float('inf')
     pace.set(8.0)
@@ -160,7 +160,7 @@ def test_recent_throughput_is_measured() -> None:
 
 @pytest.mark.parametrize('cap', [-1.0, float('inf'), float('nan')])
 def test_an_invalid_cap_is_refused(cap: float) -> None:
-    """And the old one stays."""
+    """The old cap stays in effect."""
     pace = Pace(3.0)
     with pytest.raises(ValueError, match='not a cap'):
         pace.set(cap)
@@ -169,7 +169,7 @@ def test_an_invalid_cap_is_refused(cap: float) -> None:
 
 
 def test_a_yielding_limit_expires() -> None:
-    """For so long the lower of the two is in force, for bodies under way as well; then the cap is what it was."""
+    """Until then the lower of the two applies, also to current bodies; then the original cap applies again."""
     now = [100.0]
     pace = Pace(8.0, lambda: now[0])
     pace.yield_to(2.0, 5.0)

@@ -1,4 +1,4 @@
-"""The behavior that all stores share, also with keys of other programs that are not paths."""
+"""The behavior that all stores share, also for keys of other programs that are not valid paths."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ HOSTILE = ('../escape', 'a/../../b', '/absolute', 'a//b', 'a/./b', 'a/b/', 'nul\
 
 
 def test_an_object_is_read_as_it_was_put(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """The content comes back byte for byte."""
+    """The content is returned byte for byte."""
     content = os.urandom(50_000)
     assert store.put(spool('thor/camera/20251018/120000_front.jpg', content)) is Put.CREATED
     read = store.get(bucket, 'thor/camera/20251018/120000_front.jpg')
@@ -46,7 +46,7 @@ def test_an_object_is_read_as_it_was_put(store: ObjectStore, spool: Spool, bucke
 
 
 def test_head_returns_size_type_and_metadata(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """The metadata make the round trip, the content's SHA-256 among them."""
+    """Metadata is returned unchanged, including the SHA-256 of the content."""
     item = spool('a.pcd', b'points', content_type='application/vnd.pcd', metadata={'topic': '/point_cloud2', 'samples': '7'})
     store.put(item)
     info = store.head(bucket, 'a.pcd')
@@ -61,7 +61,7 @@ def test_head_returns_size_type_and_metadata(store: ObjectStore, spool: Spool, b
     '巡' * 128,
 ])  # fmt: skip
 def test_any_text_is_metadata(store: ObjectStore, spool: Spool, bucket: str, value: str) -> None:
-    """A mission's type reads as the agent spelled it, in ``head`` and next to the content."""
+    """A mission's type reads as the agent wrote it, in ``head`` and next to the content."""
     store.put(spool('a', b'x', metadata={'mission_type': value, 'topic': '/odom'}))
     info = store.head(bucket, 'a')
     assert info is not None
@@ -71,7 +71,7 @@ def test_any_text_is_metadata(store: ObjectStore, spool: Spool, bucket: str, val
 
 
 def test_sha256_is_kept_where_the_item_has_no_metadata(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """An object is verifiable even when its spooled metadata leave the hash out."""
+    """An object can be verified even if its spooled metadata does not contain the hash."""
     item = dataclasses.replace(spool('a', b'x'), metadata={})
     store.put(item)
     info = store.head(bucket, 'a')
@@ -95,7 +95,7 @@ def test_get_of_a_missing_object_is_refused(store: ObjectStore, spool: Spool, bu
 
 
 def test_list_is_in_key_order_and_under_the_prefix(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """A prefix is a string, not a folder; sizes are told."""
+    """A prefix is a string, not a folder; sizes are included."""
     for key in ('thor/b', 'thor/a/2', 'thor/a/1', 'thor/a-1', 'tachi/a'):
         store.put(spool(key, key.encode()))
     assert [(info.key, info.size) for info in store.list(bucket, 'thor/a')] == [('thor/a-1', 8), ('thor/a/1', 8), ('thor/a/2', 8)]
@@ -103,18 +103,18 @@ def test_list_is_in_key_order_and_under_the_prefix(store: ObjectStore, spool: Sp
 
 
 def test_list_below_an_object_is_empty(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """It is not a folder."""
+    """An object is not a folder."""
     store.put(spool('thor/a', b'x'))
     assert list(store.list(bucket, 'thor/a/')) == []
 
 
 def test_a_listing_of_a_missing_bucket_is_empty(store: ObjectStore, bucket: str) -> None:
-    """A bucket that nobody has written to yet holds nothing."""
+    """It is not an error."""
     assert list(store.list(bucket)) == []
 
 
 def test_a_listing_detects_changes(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Of each object a tag of its content and when it was stored."""
+    """Each object has a tag of its content and its storage time."""
     store.put(spool('a', b'x'))
     (info,) = store.list(bucket)
     assert info.etag
@@ -123,7 +123,7 @@ def test_a_listing_detects_changes(store: ObjectStore, spool: Spool, bucket: str
 
 
 def test_folders_are_the_names_directly_below(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Not the objects, nor what lies deeper; none where there is no such bucket or folder."""
+    """Neither objects nor deeper folders; none if the bucket or folder does not exist."""
     assert list(store.folders(bucket, '')) == []
     for key in ('thor/b', 'thor/a/2', 'thor/a/deep/1', 'thor/c/1', 'tachi/a', 'top'):
         store.put(spool(key, b'x'))
@@ -133,7 +133,7 @@ def test_folders_are_the_names_directly_below(store: ObjectStore, spool: Spool, 
 
 
 def test_a_deleted_object_is_missing(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """With what was said of it; twice is not an error, and the key is free again."""
+    """Along with its metadata; deleting it twice is not an error, and the key is free again."""
     store.put(spool('a/b', b'x'))
     for _ in range(2):
         store.delete(bucket, 'a/b')
@@ -143,7 +143,7 @@ def test_a_deleted_object_is_missing(store: ObjectStore, spool: Spool, bucket: s
 
 
 def test_no_more_than_the_requested_bytes_are_read(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Whoever asks says how much it can take."""
+    """The caller sets the maximum size."""
     store.put(spool('a', b'12345'))
     assert store.get(bucket, 'a', 5) == b'12345'
     with pytest.raises(ObjectRefused, match='more than 4 bytes') as caught:
@@ -152,7 +152,7 @@ def test_no_more_than_the_requested_bytes_are_read(store: ObjectStore, spool: Sp
 
 
 def test_the_same_again_is_a_success(store: ObjectStore, spool: Spool) -> None:
-    """A put whose answer was lost can be repeated, whatever its size."""
+    """A put with a lost response can be repeated, whatever its size."""
     for key, content in (('zero', b''), ('one', b'1'), ('many', os.urandom(10_000))):
         assert store.put(spool(key, content)) is Put.CREATED
         assert store.put(spool(key, content)) is Put.IDENTICAL
@@ -160,7 +160,7 @@ def test_the_same_again_is_a_success(store: ObjectStore, spool: Spool) -> None:
 
 @pytest.mark.parametrize('other', [b'the second', b'another length'])
 def test_other_content_never_overwrites(store: ObjectStore, spool: Spool, bucket: str, other: bytes) -> None:
-    """A taken key raises ForeignObject, of the same length or not, and keeps content and metadata."""
+    """A taken key raises ForeignObject, whether or not the length is equal, and keeps its content and metadata."""
     first = spool('a', b'the first!', metadata={'writer': 'first'})
     store.put(first)
     with pytest.raises(ForeignObject, match='has other content') as caught:
@@ -173,7 +173,7 @@ def test_other_content_never_overwrites(store: ObjectStore, spool: Spool, bucket
 
 
 def test_of_concurrent_writers_one_wins(request: pytest.FixtureRequest, store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Eight threads put different content under one key: one is stored, whole, and the others are told."""
+    """Eight threads put different content under one key: one is stored completely, and the others get an error."""
     if 'moto' in request.node.callspec.id:
         pytest.skip('moto looks and writes without a lock: its race is not ours')
     items = [spool('a', bytes([number]) * 5000) for number in range(8)]
@@ -195,7 +195,7 @@ def test_of_concurrent_writers_one_wins(request: pytest.FixtureRequest, store: O
 
 
 def test_concurrent_puts_into_a_new_bucket_all_succeed(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """A missing bucket is created once, however many objects wait for it."""
+    """A missing bucket is created once, however many objects need it."""
     items = [spool(f'{number:02d}', os.urandom(1000)) for number in range(16)]
     with ThreadPoolExecutor(8) as pool:
         assert set(pool.map(store.put, items)) == {Put.CREATED}
@@ -203,14 +203,14 @@ def test_concurrent_puts_into_a_new_bucket_all_succeed(store: ObjectStore, spool
 
 
 def test_an_empty_object_is_an_object(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Zero bytes are stored, listed and got."""
+    """Zero bytes are stored, listed and read."""
     store.put(spool('empty', b''))
     assert store.get(bucket, 'empty') == b''
     assert [(info.key, info.size) for info in store.list(bucket)] == [('empty', 0)]
 
 
 def test_every_character_of_a_key_survives(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """A key of all allowed characters is put, got, headed and listed as itself."""
+    """A key with all allowed characters works in put, get, head and list."""
     store.put(spool(ALL_CHARACTERS, b'x'))
     assert store.get(bucket, ALL_CHARACTERS) == b'x'
     assert store.head(bucket, ALL_CHARACTERS) is not None
@@ -219,7 +219,7 @@ def test_every_character_of_a_key_survives(store: ObjectStore, spool: Spool, buc
 
 @pytest.mark.parametrize('key', HOSTILE)
 def test_a_hostile_key_is_refused_everywhere(store: ObjectStore, spool: Spool, bucket: str, key: str) -> None:
-    """No key leaves its bucket; none outside the safe alphabet is written, and what others wrote there can be read."""
+    """No key escapes its bucket; unsafe keys are never written, but those written by others can be read."""
     with pytest.raises(ObjectRefused):
         store.put(spool(key, b'x'))
     if key in UNUSUAL:
@@ -235,7 +235,7 @@ def test_a_hostile_key_is_refused_everywhere(store: ObjectStore, spool: Spool, b
 
 @pytest.mark.parametrize('damage', ['content', 'shorter', 'longer', 'gone', 'unreadable'])
 def test_a_damaged_file_is_refused(store: ObjectStore, spool: Spool, bucket: str, damage: str) -> None:
-    """What is no longer what was spooled is not stored under its name."""
+    """A file that differs from the spooled content is not stored."""
     item = spool('a', b'as it was')
     if damage in {'gone', 'unreadable'}:
         item.path.unlink()
@@ -250,7 +250,7 @@ def test_a_damaged_file_is_refused(store: ObjectStore, spool: Spool, bucket: str
 
 
 def test_a_probe_of_a_reachable_store_succeeds(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Neither a bucket nor an object is needed, and none is left behind, with other objects there or without."""
+    """It needs no bucket or object, and leaves none behind, with or without other objects there."""
     store.probe()
     assert list(store.list(bucket)) == []
     store.put(spool('a', b'x'))
@@ -259,7 +259,7 @@ def test_a_probe_of_a_reachable_store_succeeds(store: ObjectStore, spool: Spool,
 
 
 def test_open_and_close_may_be_repeated(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Opening twice is one opening, closing twice is not an error, and what was stored is there at the next opening."""
+    """Opening twice is the same as once, closing twice is not an error, and stored objects are there when it opens again."""
     store.open()
     store.put(spool('a', b'x'))
     store.close()
@@ -271,14 +271,14 @@ def test_open_and_close_may_be_repeated(store: ObjectStore, spool: Spool, bucket
 @settings(max_examples=examples(20), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(max_size=4096))
 def test_any_content_survives(store: ObjectStore, spool: Spool, bucket: str, content: bytes) -> None:
-    """No byte is special on the way."""
+    """All bytes are preserved."""
     item = spool(f'any/{hashlib.sha256(content).hexdigest()}', content)
     assert store.put(item) in set(Put)
     assert store.get(bucket, item.key) == content
 
 
 def test_a_mailbox_is_replaced_by_one_at_a_time(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Who read a version that is gone replaces nothing, and who knows the newest one is told that nothing changed."""
+    """A writer that read an older version replaces nothing, and one with the newest version learns whether anything changed."""
     store.put(spool('other', b'x'))
     with pytest.raises(ObjectRefused) as missing:
         store.changed(bucket, 'inbox.json', '', 100)
@@ -301,7 +301,7 @@ def test_a_mailbox_is_replaced_by_one_at_a_time(store: ObjectStore, spool: Spool
 
 
 def test_no_write_is_lost_in_a_race(request: pytest.FixtureRequest, store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Each of many writers, all at once, adds its line to what it read."""
+    """Each of many concurrent writers appends a line to the content it read."""
     if 'moto' in request.node.callspec.id:
         pytest.skip('moto reads and replaces without a lock: its race is not ours')
     store.put(spool('inbox.json', b'0'))
@@ -354,7 +354,7 @@ def server(request: pytest.FixtureRequest) -> StoreSettings:
 
 @pytest.fixture
 def emptied(server: StoreSettings, bucket: str) -> Iterator[Callable[..., list[str]]]:
-    """Fills the bucket and says which keys the server has then; deletes it afterwards."""
+    """Fills the bucket and returns the keys that the server then has; deletes it afterwards."""
     client = client_of(server)
     client.create_bucket(Bucket=bucket)
 
@@ -379,7 +379,7 @@ def emptied(server: StoreSettings, bucket: str) -> Iterator[Callable[..., list[s
 def test_a_listing_skips_and_names_invalid_keys(
     server: StoreSettings, emptied: Callable[..., list[str]], bucket: str, odd: str, opened: Callable[..., ObjectStore]
 ) -> None:
-    """The others are listed, and below a prefix of theirs; what the server made another name of is no odd key."""
+    """The others are listed, also under their prefix; a key that the server renamed is not invalid."""
     there = emptied(*GOOD, ODD[odd])
     skipped: list[tuple[str, str]] = []
     with closing(opened(server)) as store:
@@ -397,7 +397,7 @@ def test_a_listing_skips_and_names_invalid_keys(
 def test_fetch_gets_the_objects_with_valid_keys(
     server: StoreSettings, emptied: Callable[..., list[str]], bucket: str, tmp_path: Path
 ) -> None:
-    """Every object with a path is fetched; each of the others is counted as failed, under its own name."""
+    """Every object with a valid path is fetched; each of the others is counted as failed, under its name."""
     there = emptied(*GOOD, *ODD.values())
     odd = {key for key in there if key in ODD.values()}
     with closing(open_reader(server)) as store:
@@ -408,7 +408,7 @@ def test_fetch_gets_the_objects_with_valid_keys(
 
 
 def test_reindex_names_invalid_keys(server: StoreSettings, emptied: Callable[..., list[str]], bucket: str) -> None:
-    """The rows of the others are added, and what is left out is in the findings."""
+    """The rows of the others are added, and skipped keys are in the findings."""
     there = emptied(*GOOD, *ODD.values())
     odd = {f'{bucket}/{key}' for key in there if key in ODD.values()}
     findings = Findings(lambda _: None)
@@ -420,7 +420,7 @@ def test_reindex_names_invalid_keys(server: StoreSettings, emptied: Callable[...
 
 
 def test_a_folder_with_invalid_keys_is_listed(tmp_path: Path, bucket: str) -> None:
-    """Of a store that is a folder: files with control characters in their names, and with bytes that are not UTF-8."""
+    """In a directory store: files with control characters in their names, and with bytes that are not UTF-8."""
     for key in GOOD:
         (tmp_path / bucket / key).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / bucket / key).write_bytes(key.encode())
@@ -437,7 +437,7 @@ def test_a_folder_with_invalid_keys_is_listed(tmp_path: Path, bucket: str) -> No
 
 
 def test_each_invalid_key_is_logged_once(tmp_path: Path, bucket: str, caplog: pytest.LogCaptureFixture) -> None:
-    """Without anybody who counts them they are in the log, with their control characters escaped."""
+    """If the caller does not collect them they are logged, with control characters escaped."""
     (tmp_path / bucket).mkdir()
     (tmp_path / bucket / 'a\nb').write_bytes(b'x')
     with closing(open_reader(StoreSettings(directory=tmp_path))) as store:

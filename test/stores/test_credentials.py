@@ -1,4 +1,4 @@
-"""Keys of a profile: found as botocore finds them, read again once they are refused, and shown by nothing."""
+"""Keys of a profile: found as botocore finds them, read again once they are refused, and never shown."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class File:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> File:
-    """The one that AWS_SHARED_CREDENTIALS_FILE names, not there yet; nothing else has keys."""
+    """The file named by AWS_SHARED_CREDENTIALS_FILE, which does not exist yet; no other source has keys."""
     for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'AWS_SESSION_TOKEN', 'AWS_PROFILE', 'AWS_DEFAULT_PROFILE'):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv('HOME', str(tmp_path))
@@ -56,18 +56,18 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> File:
 
 @pytest.fixture
 def clock() -> list[float]:
-    """Its only element is the time."""
+    """The only element is the time."""
     return [100.0]
 
 
 def test_the_default_profile_is_used(file: File) -> None:
-    """Of the file that the variable names, with its token."""
+    """From the file in the variable, with its token."""
     file.write('KEY', SECRET, aws_session_token='token')
     assert Keys(OWN).get_frozen_credentials()[:3] == ('KEY', SECRET, 'token')
 
 
 def test_the_credentials_file_in_the_home_is_used(file: File, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where no variable names another one."""
+    """If no variable names another file."""
     monkeypatch.delenv('AWS_SHARED_CREDENTIALS_FILE')
     (tmp_path / '.aws').mkdir()
     File(tmp_path / '.aws' / 'credentials').write('KEY', SECRET)
@@ -75,7 +75,7 @@ def test_the_credentials_file_in_the_home_is_used(file: File, tmp_path: Path, mo
 
 
 def test_a_named_profile_is_used(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
-    """AWS_PROFILE names it; of the configuration file as well."""
+    """AWS_PROFILE names it; also from the configuration file."""
     file.write('KEY', SECRET, 'robot')
     monkeypatch.setenv('AWS_PROFILE', 'robot')
     assert Keys(OWN).get_frozen_credentials().access_key == 'KEY'
@@ -89,7 +89,7 @@ def test_a_named_profile_is_used(file: File, monkeypatch: pytest.MonkeyPatch) ->
 def test_every_client_signs_with_the_same_profile(
     file: File, monkeypatch: pytest.MonkeyPatch, client: type[S3Store | ObstoreStore]
 ) -> None:
-    """And reports in the same words that there is no such profile."""
+    """A missing profile is reported with the same message."""
     file.write('KEY', SECRET, 'robot')
     signed: list[str] = []
     answer = Handler.do_GET
@@ -111,7 +111,7 @@ def test_every_client_signs_with_the_same_profile(
 
 
 def test_the_tables_of_the_lake_are_read_with_the_same_profile(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By delta-rs, which gets the keys in hand."""
+    """delta-rs gets the keys directly."""
     file.write('KEY', SECRET, 'robot', aws_session_token='token')
     monkeypatch.setenv('AWS_PROFILE', 'robot')
     found = storage_options(OWN)
@@ -130,13 +130,13 @@ def test_keys_in_the_settings_take_precedence(file: File) -> None:
 
 
 def test_half_a_key_pair_aborts_startup() -> None:
-    """The other half is named."""
+    """The missing half is named."""
     with pytest.raises(SettingError, match='AWS_SECRET_ACCESS_KEY'):
         Keys(dataclasses.replace(OWN, access_key_id='FIRST'))
 
 
 def test_no_metadata_service_is_queried_for_credentials(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither the cloud's metadata service nor a container's, and so a start without keys takes no time."""
+    """Neither that of the cloud nor a container's, so a start without keys takes no time."""
     monkeypatch.setenv('AWS_CONTAINER_CREDENTIALS_FULL_URI', 'http://127.0.0.1:1/keys')
     monkeypatch.setattr(InstanceMetadataProvider, 'load', lambda _: pytest.fail('the metadata service is asked'))
     with pytest.raises(NoCredentialsError):
@@ -144,7 +144,7 @@ def test_no_metadata_service_is_queried_for_credentials(file: File, monkeypatch:
 
 
 def test_refused_keys_are_read_again(file: File, clock: list[float]) -> None:
-    """Another pair is another generation; the same one, a broken file or none at all leave what there was."""
+    """Another pair is a new generation; with the same one, a broken file or none the old one is kept."""
     file.write('OLD', 'old')
     keys = Keys(OWN, lambda: clock[0])
     keys.get_frozen_credentials()
@@ -165,7 +165,7 @@ def test_refused_keys_are_read_again(file: File, clock: list[float]) -> None:
 
 
 def test_many_refusals_cause_one_reading(file: File, clock: list[float]) -> None:
-    """Who was refused with the old keys hears of the new ones without reading; who was refused with the new ones waits."""
+    """A caller refused with the old keys gets the new ones without reading; a caller refused with the new ones waits."""
     file.write('OLD', 'old')
     keys = Keys(OWN, lambda: clock[0])
     keys.get_frozen_credentials()
@@ -180,7 +180,7 @@ def test_many_refusals_cause_one_reading(file: File, clock: list[float]) -> None
 
 
 def test_keys_that_are_added_later_are_used(file: File, clock: list[float]) -> None:
-    """A file that is put there while the program runs is found; half of one is said to be half."""
+    """A file created while the program runs is found; half a key pair is reported as such."""
     keys = Keys(OWN, lambda: clock[0])
     with pytest.raises(NoCredentialsError):
         keys.get_frozen_credentials()
@@ -195,7 +195,7 @@ def test_a_put_resumes_with_new_keys(
     file: File, opened: Callable[..., S3Store], spool: Spool, seaweed: Tower, monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    """A refusal, of a whole object or of one in parts, is not a failure where other keys are in the file by now."""
+    """A refusal, of a single put or a multipart upload, is not a failure if the file has other keys by then."""
     caplog.set_level(logging.DEBUG)
     good = seaweed.store_settings()
     store = opened(dataclasses.replace(good, access_key_id=None, secret_access_key=None))
@@ -211,7 +211,7 @@ def test_a_put_resumes_with_new_keys(
 
 
 def until_read(store: S3Store, key: str) -> None:
-    """As if it had been refused before."""
+    """Continue as after a refusal."""
     time_passes(store)
     keys: Any = store._client._keys
     keys.renew(keys.generation)
@@ -227,7 +227,7 @@ def time_passes(store: S3Store) -> None:
 def test_every_refusal_of_keys_reads_them_again(
     code: str, file: File, opened: Callable[..., S3Store], spool: Spool
 ) -> None:  # fmt: skip
-    """And what the new ones are refused for is said, after two tries and no more."""
+    """After two tries the reason for refusing the new ones is reported."""
     file.write('OLD', SECRET)
     with served(FakeS3(answer=(403, error(code)))) as server:
         store = opened(StoreSettings(endpoint_url=server.url))
@@ -243,7 +243,7 @@ def test_every_refusal_of_keys_reads_them_again(
 
 
 def test_nothing_shows_a_secret(file: File) -> None:
-    """Not the keys, and not their reader."""
+    """Neither the keys nor their reader."""
     file.write('KEY', SECRET)
     keys = Keys(OWN)
     keys.get_frozen_credentials()

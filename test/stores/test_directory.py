@@ -1,4 +1,4 @@
-"""What is particular to the folder: its layout, its durability, and the errors of a file system."""
+"""The directory store: its layout, its durability, and the errors of a file system."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ def _failing(number: int) -> Callable[..., Any]:
 
 
 def test_without_an_endpoint_the_store_is_a_folder(folder: Path) -> None:
-    """Defaults work with nothing set, and nothing is written before the first put."""
+    """The defaults need no setting, and nothing is written before the first put."""
     store = open_store(StoreSettings(directory=folder), QUICK)
     assert store.describe() == f'the folder {folder}'
     assert not folder.exists()
 
 
 def test_the_folder_is_laid_out_like_the_bucket(store: DirectoryStore, folder: Path, spool: Spool) -> None:
-    """Beside a bucket's objects lies nothing that a sync or a glob would take for one, and no unfinished file is left."""
+    """Next to a bucket's objects there is nothing that a sync or a glob would mistake for one, and no unfinished file."""
     store.put(spool('thor/camera/a.jpg', b'x', bucket='sensor-data'))
     files = {str(path.relative_to(folder)) for path in folder.rglob('*') if path.is_file()}
     assert files == {'sensor-data/thor/camera/a.jpg', '.metadata/sensor-data/thor/camera/a.jpg.json'}
 
 
 def test_objects_interrupted_by_a_power_cut_are_completed(store: DirectoryStore, folder: Path, spool: Spool, bucket: str) -> None:
-    """Content without its metadata is recognized by its hash, and the next put writes them."""
+    """Content without metadata is recognized by its hash, and the next put adds the metadata."""
     item = spool('a', b'content')
     store.put(item)
     (folder / '.metadata' / bucket / 'a.json').unlink()
@@ -75,7 +75,7 @@ def test_a_file_put_there_by_hand_is_never_overwritten(store: DirectoryStore, fo
 def test_everything_is_synced_before_it_has_its_name(
     store: DirectoryStore, folder: Path, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file is synced before the link, the folder after it: a power cut shows all of an object or nothing."""
+    """The file is synced before the link, the folder after it: after a power cut an object is complete or missing."""
     events: list[str] = []
     sync, link = os.fsync, os.link
 
@@ -109,7 +109,7 @@ def test_errors_of_the_file_system_are_translated(
     number: int, kind: type[StoreError], words: str,
     store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """A full or sick disk is waited for; nothing half-written is left, and later the same put succeeds."""
+    """A full or failing disk is retried; no partial file is left, and later the same put succeeds."""
     item = spool('a', b'x')
     with monkeypatch.context() as broken:
         broken.setattr(os, 'fsync', _failing(number))
@@ -122,7 +122,7 @@ def test_errors_of_the_file_system_are_translated(
 
 
 def test_an_unusable_folder_quarantines_no_object(spool: Spool) -> None:
-    """A wrong setting (the folder is a file, or below one) is waited for, by put and by probe."""
+    """A wrong setting (the folder is a file, or below one) is retried, by put and by probe."""
     item = spool('a', b'x')
     for folder in (item.path, item.path / 'below'):
         store = DirectoryStore(folder)
@@ -133,7 +133,7 @@ def test_an_unusable_folder_quarantines_no_object(spool: Spool) -> None:
 
 
 def test_an_object_is_no_folder_and_a_folder_no_object(store: DirectoryStore, spool: Spool) -> None:
-    """A file system cannot hold both ``a`` and ``a/b``: the second is refused for good."""
+    """A file system cannot hold both ``a`` and ``a/b``: the second is refused permanently."""
     store.put(spool('a/b', b'x'))
     for key in ('a', 'a/b/c'):
         with pytest.raises(ObjectRefused, match='cannot hold'):
@@ -143,7 +143,7 @@ def test_an_object_is_no_folder_and_a_folder_no_object(store: DirectoryStore, sp
 def test_the_store_works_on_a_file_system_without_links(
     store: DirectoryStore, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without hard links (exFAT) objects are still whole and never overwritten."""
+    """Without hard links (exFAT) objects are still complete and never overwritten."""
     monkeypatch.setattr(os, 'link', _failing(errno.EPERM))
     assert store.put(spool('a', b'first')) is Put.CREATED
     with pytest.raises(ForeignObject):
@@ -154,7 +154,7 @@ def test_the_store_works_on_a_file_system_without_links(
 
 @pytest.mark.parametrize('record', ['[]', '{}', '7', '{"metadata": 7, "content_type": ""}', '{"metadata": {}}', '[' * 100_000])
 def test_an_invalid_record_is_ignored(store: DirectoryStore, spool: Spool, bucket: str, tmp_path: Path, record: str) -> None:
-    """Whoever wrote it: the object is there, known by its content alone, and can be listed, read and put again."""
+    """Whatever wrote it: the object has only its content, and can be listed, read and put again."""
     item = spool('a', b'first')
     store.put(item)
     (beside,) = tmp_path.rglob('a.json')
@@ -169,7 +169,7 @@ def test_an_invalid_record_is_ignored(store: DirectoryStore, spool: Spool, bucke
 def test_users_share_a_folder_without_links(
     store: DirectoryStore, spool: Spool, bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lock may be used by whoever may write to the folder, as the umask of its first user says."""
+    """Any user who may write to the folder may use the lock, according to the umask of its first user."""
     monkeypatch.setattr(os, 'link', _failing(errno.EPERM))
     before = os.umask(0o002)
     try:

@@ -1,4 +1,4 @@
-"""What every store does alike when something is read: ranges, pieces, downloads that are taken up again."""
+"""Reading, the same for every store: ranges, pieces, resumed downloads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KEY = 'thor/rosbags/patrol/patrol_0.mcap'
 
 
 def test_a_range_is_a_slice(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """It has the bytes that a slice of the content has: fewer at its end, none behind it."""
+    """It has the bytes of a slice of the content: fewer at the end, none beyond it."""
     store.put(spool(KEY, CONTENT))
     end = len(CONTENT)
     for start, length in ((0, 1), (0, 10), (5, 1000), (CHUNK_BYTES - 1, CHUNK_BYTES + 2), (end - 3, 3), (end - 3, 100),
@@ -31,7 +31,7 @@ def test_a_range_is_a_slice(store: ObjectStore, spool: Spool, bucket: str) -> No
 
 
 def test_ranges_arrive_in_the_requested_order(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Several at once, some behind the end, some empty."""
+    """Several at the same time, some beyond the end, some empty."""
     store.put(spool(KEY, CONTENT))
     end = len(CONTENT)
     spans = [(100, 200), (0, 10), (end - 5, end + 5), (end, end + 5), (7, 7), (CHUNK_BYTES, CHUNK_BYTES + 1)]
@@ -39,7 +39,7 @@ def test_ranges_arrive_in_the_requested_order(store: ObjectStore, spool: Spool, 
 
 
 def test_content_has_the_size_of_the_object(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Wherever it begins: the size, and what was stored with it; it can be left unread."""
+    """From any offset: the size and the metadata; it need not be read."""
     item = spool('a', b'0123456789', metadata={'topic': '/x'})
     store.put(item)
     for start in (0, 4, 10, 20):
@@ -49,7 +49,7 @@ def test_content_has_the_size_of_the_object(store: ObjectStore, spool: Spool, bu
 
 
 def test_a_range_of_a_missing_object_is_refused(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """A missing key is named in the error, also where it is read in pieces."""
+    """A missing key is named in the error, also when it is read in pieces."""
     store.put(spool('a', b'x'))
     with pytest.raises(ObjectRefused, match=f'there is no {bucket}/b'):
         store.ranges(bucket, 'b', [(0, 5)])
@@ -71,7 +71,7 @@ def wanted(bucket: str, size: int = len(CONTENT), sha256: str | None = None) -> 
 
 
 def test_a_download_has_the_content_of_the_object(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
-    """The file has the content, what arrived was told, and nothing else is left."""
+    """The file has the content, progress was reported, and nothing else is left."""
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
     path = tmp_path / 'out' / 'a.mcap'
@@ -84,7 +84,7 @@ def test_a_download_has_the_content_of_the_object(store: ObjectStore, spool: Spo
 
 
 def test_an_interrupted_download_resumes(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
-    """What lies there is not fetched again."""
+    """Existing bytes are not downloaded again."""
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(CONTENT[: CHUNK_BYTES + 5])
     told: list[int] = []
@@ -95,7 +95,7 @@ def test_an_interrupted_download_resumes(store: ObjectStore, spool: Spool, bucke
 
 @pytest.mark.parametrize('there', [b'wrong', bytes(len(CONTENT)), CONTENT + b'more'])
 def test_a_corrupt_download_restarts(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path, there: bytes) -> None:
-    """What does not fit is thrown away, as the caller is told, and fetched once more."""
+    """Bytes that do not match are discarded, with a notice to the caller, and downloaded once more."""
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(there)
     told = [len(there)]
@@ -108,7 +108,7 @@ def test_a_corrupt_download_restarts(store: ObjectStore, spool: Spool, bucket: s
 def test_a_download_with_wrong_content_leaves_no_file(
     store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path, how: dict[str, Any]
 ) -> None:
-    """Of another size or content than the caller knows: refused the second time, and nothing stays."""
+    """With a size or content other than expected: refused the second time, and nothing stays."""
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
     with pytest.raises(ObjectRefused, match='does not match its metadata') as caught:
@@ -119,7 +119,7 @@ def test_a_download_with_wrong_content_leaves_no_file(
 
 
 def test_content_of_another_version_is_refused(store: ObjectStore, spool: Spool, bucket: str) -> None:
-    """Each answer names its version, and one that is asked for by its name is that one or none."""
+    """Each response has its version, and a request for a version gets that version or an error."""
     store.put(spool('a', b'0123456789'))
     with store.content(bucket, 'a') as content:
         before = content.info.etag
@@ -135,14 +135,14 @@ def test_content_of_another_version_is_refused(store: ObjectStore, spool: Spool,
 
 
 def known(store: ObjectStore, bucket: str, key: str) -> str:
-    """The version of an object as ``replace`` knows it."""
+    """The version of an object, as for ``replace``."""
     found = store.changed(bucket, key, '"none"', 1 << 30)
     assert found is not None
     return found[1]
 
 
 def test_a_download_of_a_changed_object_restarts(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
-    """Where a connection broke and another content is there meanwhile, none of the first one stays."""
+    """If a connection broke and the content has changed since, no byte of the old content stays."""
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
     after = os.urandom(len(CONTENT))
@@ -160,7 +160,7 @@ def test_a_download_of_a_changed_object_restarts(store: ObjectStore, spool: Spoo
 
 
 class Short(MemoryStore):
-    """Breaks off after four bytes each time."""
+    """Stops after four bytes each time."""
 
     asked = 0
 
@@ -170,7 +170,7 @@ class Short(MemoryStore):
 
 
 def test_a_truncated_download_resumes(tmp_path: Path) -> None:
-    """The store ends the content before its size: the next try asks for the rest alone, after a pause."""
+    """The store ends the content early: the next try requests only the rest, after a pause."""
     store, pauses = Short(), list[float]()
     found = download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', pause=pauses.append)
     assert (tmp_path / 'file').read_bytes() == b'0123456789'
@@ -178,7 +178,7 @@ def test_a_truncated_download_resumes(tmp_path: Path) -> None:
 
 
 def test_a_partial_download_survives_an_outage(tmp_path: Path) -> None:
-    """So many tries, then the error; the next call goes on."""
+    """After several tries there is an error; the next call continues."""
 
     class Away(Short):
         def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:

@@ -49,7 +49,7 @@ FAULTS: dict[str, tuple[Faulty, str]] = {
 
 @pytest.mark.parametrize('fault', FAULTS)
 def test_a_server_without_an_answer_is_unavailable(fault: str, opened: Callable[..., S3Store], spool: Spool) -> None:
-    """A Tower that is away is StoreUnavailable, and the message tells its kinds apart and names the endpoint."""
+    """An unreachable Tower is StoreUnavailable, and the message gives the cause and the endpoint."""
     start, words = FAULTS[fault]
     with start() as url:
         store = opened(url, IMPATIENT if fault == 'hung' else QUICK)
@@ -66,7 +66,7 @@ def test_an_unknown_host_is_unavailable(opened: Callable[..., S3Store], spool: S
 
 
 def test_every_wait_ends(opened: Callable[..., S3Store], spool: Spool) -> None:
-    """A hung server costs the read timeout, not botocore's minute and its retries."""
+    """A hung server costs the read timeout, not botocore's minute with retries."""
     with fake_s3.hung() as url:
         store = opened(url, IMPATIENT)
         begin = time.monotonic()
@@ -89,7 +89,7 @@ ANSWERS: dict[str, tuple[int, bytes, type[StoreError], str]] = {
 
 @pytest.mark.parametrize('answer', ANSWERS)
 def test_an_invalid_answer_means_an_unavailable_store(answer: str, opened: Callable[..., S3Store], spool: Spool) -> None:
-    """No answer but an S3 server's own confirms a put or condemns an object."""
+    """Only a response of an S3 server confirms a put or rejects an object."""
     status, body, kind, words = ANSWERS[answer]
     with served(FakeS3(answer=(status, body))) as server:
         store = opened(server.url)
@@ -100,7 +100,7 @@ def test_an_invalid_answer_means_an_unavailable_store(answer: str, opened: Calla
 
 
 def test_the_store_recovers_automatically(opened: Callable[..., S3Store], spool: Spool) -> None:
-    """When the cause is gone the same store goes on."""
+    """When the fault ends the same store continues."""
     with served(FakeS3(answer=(503, fake_s3.error('SlowDown')))) as server:
         store = opened(server.url)
         error_of(StoreUnavailable, lambda: store.put(spool('a', b'x')))
@@ -109,7 +109,7 @@ def test_the_store_recovers_automatically(opened: Callable[..., S3Store], spool:
 
 
 def test_the_client_retries_nothing_itself(opened: Callable[..., S3Store]) -> None:
-    """One request is one request, also when it fails."""
+    """One call is one request, even if it fails."""
     with served(FakeS3(answer=(503, fake_s3.error('SlowDown')))) as server:
         error_of(StoreUnavailable, opened(server.url).probe)
         assert server.requests == ['GET']
@@ -119,7 +119,7 @@ def test_the_client_retries_nothing_itself(opened: Callable[..., S3Store]) -> No
 def test_a_large_object_is_streamed(
     opened: Callable[..., S3Store], spool: Spool, seaweed: Tower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beyond the limit the file is sent from the disk, with checksum, hash and condition as ever."""
+    """Above the limit the file is sent from the disk, with checksum, hash and condition as usual."""
     monkeypatch.setattr(s3_puts, 'STREAM_BYTES', 1000)
     store = opened(seaweed.store_settings())
     item = spool('large', b'0123456789' * 500_000)
@@ -130,7 +130,7 @@ def test_a_large_object_is_streamed(
 
 @pytest.mark.seaweedfs
 def test_the_server_verifies_the_checksum(seaweed: Tower, spool: Spool, bucket: str) -> None:
-    """A SHA-256 that is not the content's is refused by the server, is a reason to send again, and leaves nothing there."""
+    """The server refuses a SHA-256 that differs from the content's; the put is retried, and nothing is left there."""
     client = S3Client(seaweed.store_settings(), QUICK)
     client.open()
     requests = S3Requests(client)
@@ -145,7 +145,7 @@ def test_the_server_verifies_the_checksum(seaweed: Tower, spool: Spool, bucket: 
 
 
 def test_https_to_a_plain_port_is_named(opened: Callable[..., S3Store]) -> None:
-    """TLS where there is none is explained."""
+    """The error explains that the port has no TLS."""
     with served(FakeS3()) as server:
         said = error_of(StoreUnavailable, opened(server.url.replace('http:', 'https:')).probe)
     assert 'no TLS connection' in said
@@ -154,7 +154,7 @@ def test_https_to_a_plain_port_is_named(opened: Callable[..., S3Store]) -> None:
 def test_a_name_and_a_password_in_the_url_are_not_sent(
     opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are none of the host's name, which stands in each request for all to read; a path is part of every one."""
+    """They are not part of the host name, which is in each request in plain text; a path is part of every URL."""
     with served(FakeS3()) as server:
         asked: list[tuple[str, str]] = []
         handler = server.RequestHandlerClass
@@ -172,7 +172,7 @@ def test_a_name_and_a_password_in_the_url_are_not_sent(
 
 @pytest.mark.seaweedfs
 def test_a_wrong_secret_rejects_the_credentials(opened: Callable[..., S3Store], seaweed: Tower, spool: Spool) -> None:
-    """A wrong secret is told from a wrong key id, by put, probe, head and get, and shown by none."""
+    """A wrong secret is distinguished from a wrong key id, by put, probe, head and get, and is not shown."""
     good = seaweed.store_settings()
     bad_secret = opened(dataclasses.replace(good, secret_access_key=SECRET))
     bad_key = opened(dataclasses.replace(good, access_key_id='NOBODY', secret_access_key=SECRET))
@@ -186,7 +186,7 @@ def test_a_wrong_secret_rejects_the_credentials(opened: Callable[..., S3Store], 
 def test_a_file_deleted_before_it_is_sent_is_reported(
     opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Evicted in that instant, say: it is refused as gone, and nothing but a store's error leaves the store."""
+    """For example evicted at that moment: it is refused as gone, and only the store's errors are raised."""
     item = spool('a', bytes(s3_puts.STREAM_BYTES + 1))
 
     def gone(given: SpooledObject) -> Iterator[bytes]:
@@ -202,7 +202,7 @@ def test_a_file_deleted_before_it_is_sent_is_reported(
 def test_without_credentials_the_variables_are_named(
     opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Without credentials the names of the variables are in the message."""
+    """The error has the names of the variables."""
     for name in ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'AWS_PROFILE'):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv('AWS_SHARED_CREDENTIALS_FILE', str(tmp_path / 'none'))
@@ -216,7 +216,7 @@ def test_without_credentials_the_variables_are_named(
 def test_a_profile_of_the_shell_does_not_affect_given_credentials(
     opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """AWS_PROFILE naming a profile that does not exist stops botocore, not us."""
+    """An AWS_PROFILE that does not exist stops botocore, but not the store."""
     monkeypatch.setenv('AWS_PROFILE', 'not-there')
     with served(FakeS3()) as server:
         assert opened(server.url).put(spool('a', b'x')) is Put.CREATED
@@ -226,7 +226,7 @@ def test_a_profile_of_the_shell_does_not_affect_given_credentials(
 def test_a_bucket_that_cannot_be_created_is_missing(
     opened: Callable[..., S3Store], seaweed: Tower, spool: Spool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The bucket, the endpoint and the remedy are named; when somebody made the bucket, delivery goes on at once."""
+    """The bucket, the endpoint and the remedy are named; once an administrator creates it, delivery continues immediately."""
     settings = seaweed.store_settings('limited')
     store = opened(settings)
 
@@ -241,7 +241,7 @@ def test_a_bucket_that_cannot_be_created_is_missing(
 
 
 def test_a_rejected_bucket_is_probed_once(opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Within the pause only the puts themselves ask; after it the next one tries to create it again."""
+    """Within the pause only the puts themselves are sent; after it the next one tries to create the bucket again."""
     with served(FakeS3(without_buckets=True)) as server:
         store = opened(server.url)
         for _ in range(3):
@@ -255,7 +255,7 @@ def test_a_rejected_bucket_is_probed_once(opened: Callable[..., S3Store], spool:
 
 @pytest.mark.seaweedfs
 def test_denied_is_not_missing(opened: Callable[..., S3Store], seaweed: Tower, spool: Spool, bucket: str) -> None:
-    """Valid credentials without the right to this bucket are AccessDenied; the probe finds nothing wrong with them."""
+    """Valid credentials without the permission for this bucket are AccessDenied; the probe reports no problem with them."""
     opened(seaweed.store_settings()).put(spool('a', b'x'))
     store = opened(seaweed.store_settings('limited'))
     store.probe()
@@ -266,7 +266,7 @@ def test_denied_is_not_missing(opened: Callable[..., S3Store], seaweed: Tower, s
 
 @pytest.mark.seaweedfs
 def test_a_key_that_is_a_folder_is_refused(opened: Callable[..., S3Store], seaweed: Tower, spool: Spool) -> None:
-    """Where a server cannot hold both ``a`` and ``a/b``, ``a`` is refused instead of waiting for ever."""
+    """If a server cannot hold both ``a`` and ``a/b``, ``a`` is refused instead of being retried indefinitely."""
     store = opened(seaweed.store_settings())
     with_room(lambda: store.put(spool('a/b', b'x')))
     assert 'is a folder' in error_of(ObjectRefused, lambda: store.put(spool('a', b'x')))
@@ -274,7 +274,7 @@ def test_a_key_that_is_a_folder_is_refused(opened: Callable[..., S3Store], seawe
 
 @pytest.mark.seaweedfs
 def test_an_invalid_bucket_name_is_refused(opened: Callable[..., S3Store], seaweed: Tower, spool: Spool) -> None:
-    """Upper case in a bucket's name is explained; its objects wait for a better setting."""
+    """Uppercase letters in a bucket's name are explained; its objects wait for a valid setting."""
     store = opened(seaweed.store_settings())
     assert 'lower-case' in error_of(BucketMissing, lambda: store.put(spool('a', b'x', bucket='Sensor-Data')))
 
@@ -298,14 +298,14 @@ def test_settings_that_cannot_work_abort_startup(settings: StoreSettings, name: 
 
 
 def test_nothing_shows_a_secret(opened: Callable[..., S3Store]) -> None:
-    """Neither the description nor a repr holds the secret or what somebody wrote into the URL."""
+    """Neither the description nor a repr contains the secret or credentials in the URL."""
     store = opened(settings_for('http://user:url-password@127.0.0.1:1'))
     text = store.describe() + repr(store) + repr(settings_for('http://127.0.0.1:1')) + error_of(StoreUnavailable, store.probe)
     assert not re.search('Secret|url-password', text)
 
 
 def test_a_closed_store_raises(opened: Callable[..., S3Store], spool: Spool) -> None:
-    """Use after close is an error of the tree, not an AttributeError."""
+    """Use after close raises an error of the store, not an AttributeError."""
     store = opened('http://127.0.0.1:1')
     store.close()
     with pytest.raises(StoreUnavailable, match='not open'):

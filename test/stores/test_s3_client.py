@@ -30,7 +30,7 @@ class Gateway(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, *_: object) -> None:
-        """Quiet."""
+        """Log nothing."""
 
 
 @pytest.fixture(scope='module')
@@ -52,7 +52,7 @@ def tower() -> Iterator[FakeS3]:
 
 @pytest.fixture
 def environ(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    """Without any proxy."""
+    """An environment without any proxy."""
     for name in [name for name in os.environ if name.lower().endswith('_proxy')]:
         monkeypatch.delenv(name)
     return monkeypatch
@@ -84,7 +84,7 @@ def test_all_clients_use_the_same_proxy(
     client: type[S3Store | ObstoreStore], host: str, variables: dict[str, str], proxy: str, tower: FakeS3,
     environ: pytest.MonkeyPatch, *, is_proxied: bool,
 ) -> None:  # fmt: skip
-    """That of Python's own rules: NO_PROXY takes names, their ends and ports, but no networks, and ALL_PROXY does not count."""
+    """By Python's rules: NO_PROXY has names, suffixes and ports, but no networks, and ALL_PROXY is ignored."""
     for name, text in variables.items():
         environ.setenv(name, text.replace('PROXY', proxy).replace('PORT', str(tower.server_port)))
     with pytest.raises(StoreUnavailable if is_proxied else ObjectRefused, match='502' if is_proxied else 'there is no'):
@@ -93,7 +93,7 @@ def test_all_clients_use_the_same_proxy(
 
 @pytest.mark.parametrize('client', CLIENTS)
 def test_an_unreachable_proxy_is_named(client: type[S3Store | ObstoreStore], tower: FakeS3, environ: pytest.MonkeyPatch) -> None:
-    """It is not Tower that does not answer."""
+    """The error is not about Tower."""
     environ.setenv('HTTP_PROXY', 'http://127.0.0.1:9')
     with pytest.raises(StoreUnavailable, match=f'the proxy to {tower.url} cannot be reached') as raised:
         get(client, tower.url)
@@ -101,7 +101,7 @@ def test_an_unreachable_proxy_is_named(client: type[S3Store | ObstoreStore], tow
 
 
 class Recorder(ThreadingHTTPServer):
-    """A server without any object, or a proxy to one; it counts requests."""
+    """A server without any object, or a proxy for one; it counts requests."""
 
     def __init__(self) -> None:
         super().__init__(('127.0.0.1', 0), Nothing)
@@ -113,7 +113,7 @@ class Recorder(ThreadingHTTPServer):
 
 
 class Nothing(BaseHTTPRequestHandler):
-    """Answers 404."""
+    """Responds with 404."""
 
     server: Recorder
 
@@ -152,7 +152,7 @@ def recorders() -> Iterator[tuple[Recorder, Recorder]]:
 def test_the_tables_of_the_lake_use_the_same_proxy(
     recorders: tuple[Recorder, Recorder], environ: pytest.MonkeyPatch, variables: dict[str, str], *, is_proxied: bool
 ) -> None:
-    """They are read by delta-rs, which has its own S3 client."""
+    """delta-rs reads them, which has a separate S3 client."""
     proxy, server = recorders
     for name, text in variables.items():
         environ.setenv(name, text.replace('PROXY', proxy.url).replace('PORT', str(server.server_port)))

@@ -1,4 +1,4 @@
-"""Each failure of an S3 client has its class and its words; each fault, over a real server, loses nothing."""
+"""Each failure of an S3 client has its class and message; faults in front of a real server lose nothing."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ ANSWERS: tuple[tuple[int, str, type[StoreError]], ...] = (
     (503, 'SlowDownWrite', StoreUnavailable),
     (503, 'XMinioServerNotInitialized', StoreUnavailable),
     (507, 'XMinioStorageFull', StoreUnavailable),
-    # Without an S3 error in it an answer says nothing of an object.
+    # Without an S3 error a response is no evidence about an object.
     (302, '302', StoreUnavailable),
     (400, '400', StoreUnavailable),
     (403, '403', StoreUnavailable),
@@ -116,7 +116,7 @@ def _answer(status: int, code: str, operation: str = 'PutObject') -> boto.Client
 
 @pytest.mark.parametrize(('status', 'code', 'kind'), ANSWERS)
 def test_each_answer_has_its_class(status: int, code: str, kind: type[StoreError]) -> None:
-    """The code decides, else the status; the endpoint or the bucket is named, and a program can read the code."""
+    """The code decides, otherwise the status; the endpoint or the bucket is named, and programs can read the code."""
     error = classify(_answer(status, code), ASKED)
     assert type(error) is kind
     assert URL in str(error)
@@ -127,14 +127,14 @@ def test_each_answer_has_its_class(status: int, code: str, kind: type[StoreError
 
 @pytest.mark.parametrize(('failure', 'kind', 'words'), FAILURES)
 def test_each_failure_without_an_answer_has_its_class_and_words(failure: Exception, kind: type[StoreError], words: str) -> None:
-    """What did not reach the server is told apart."""
+    """Failures before the server was reached are distinguished."""
     error = classify(failure, ASKED)
     assert type(error) is kind
     assert words in str(error)
 
 
 def test_a_refused_head_has_no_body_and_is_access_denied() -> None:
-    """The only 403 without an S3 error that may come from an S3 server."""
+    """It is the only 403 without an S3 error that may come from an S3 server."""
     assert type(classify(_answer(403, '403', 'HeadObject'), ASKED)) is AccessDenied
 
 
@@ -147,7 +147,7 @@ def test_a_refused_head_has_no_body_and_is_access_denied() -> None:
     ],
 )
 def test_a_url_is_shown_without_its_password(url: str, shown: str) -> None:
-    """Whatever stands before the last @ of the host part is gone."""
+    """Everything before the last @ of the host part is removed."""
     assert public_url(url) == shown
 
 
@@ -171,7 +171,7 @@ def front(seaweed: Tower) -> Iterator[Front]:
 
 @pytest.fixture(scope='module')
 def direct(seaweed: Tower) -> Iterator[S3Store]:
-    """The server without the front."""
+    """The server without the proxy."""
     store = S3Store(seaweed.store_settings(), UploadSettings())
     store.open()
     yield store
@@ -180,7 +180,7 @@ def direct(seaweed: Tower) -> Iterator[S3Store]:
 
 @pytest.fixture
 def opened(request: pytest.FixtureRequest, seaweed: Tower, front: Front) -> Iterator[S3Store]:
-    """The server behind the front; only where no answer comes in time is there no time for one."""
+    """The server behind the proxy; with a short timeout only for faults without a response."""
     fault = getattr(request.node, 'callspec', None) and request.node.callspec.params.get('fault')
     patience = IMPATIENT if fault in {Fault.HUNG, Fault.SLOW} else UploadSettings()
     store = S3Store(replace(seaweed.store_settings(), endpoint_url=front.url), patience)
@@ -191,7 +191,7 @@ def opened(request: pytest.FixtureRequest, seaweed: Tower, front: Front) -> Iter
 
 @pytest.fixture
 def patient(seaweed: Tower, front: Front) -> Iterator[S3Store]:
-    """The server behind the front, for those who have seen enough of the fault."""
+    """The server behind the proxy, with long timeouts, for use after the fault."""
     store = S3Store(replace(seaweed.store_settings(), endpoint_url=front.url), UploadSettings())
     store.open()
     yield store
@@ -200,7 +200,7 @@ def patient(seaweed: Tower, front: Front) -> Iterator[S3Store]:
 
 @pytest.fixture
 def key() -> str:
-    """One that no other test has used: they share a bucket, which takes the server some time to make."""
+    """A key that no other test has used: all share a bucket, which the server takes some time to create."""
     return uuid.uuid4().hex
 
 
@@ -211,13 +211,13 @@ def spool(tmp_path: Path) -> Spool:
 
 @pytest.fixture
 def proved(opened: S3Store, spool: Spool) -> S3Store:
-    """The store knows what it needs of its server: each put is one request from here on."""
+    """The store has tested its server: each put is one request from here on."""
     again(opened, spool(uuid.uuid4().hex, b'proof'))
     return opened
 
 
 def again(store: S3Store, item: SpooledObject) -> Put:
-    """Put until it works."""
+    """Put until it succeeds."""
     ends: list[Put] = []
 
     def works() -> bool:
@@ -236,7 +236,7 @@ def again(store: S3Store, item: SpooledObject) -> Put:
 def test_each_fault_is_distinguished_and_the_next_put_succeeds_once(
     fault: Fault, proved: S3Store, patient: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
 ) -> None:
-    """It is told from the others, the object is there or not as the fault has it, and the next put makes it so, once."""
+    """Each has its error, the object exists or not as the fault implies, and after the next put it exists, once."""
     item = spool(key, CONTENT)
     again(patient, spool(uuid.uuid4().hex, b'proof'))
     front.cut = lambda _: STATUS_LINE
@@ -253,7 +253,7 @@ def test_each_fault_is_distinguished_and_the_next_put_succeeds_once(
 
 @pytest.mark.seaweedfs
 def test_a_refused_connection_is_retried(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
-    """For a while there is no connection at all, and then there is."""
+    """For a while no connection is possible, and then one is."""
     front.refuse()
 
     def refused() -> bool:
@@ -272,7 +272,7 @@ def test_a_refused_connection_is_retried(proved: S3Store, front: Front, spool: S
 def test_a_server_without_if_none_match_overwrites_nothing(
     condition: Condition, opened: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
 ) -> None:
-    """From the first put on nothing is overwritten, whether it admits that or not."""
+    """Even the first put overwrites nothing, whether or not the server reports its lack of support."""
     front.condition = condition
     direct.put(spool(key, b'theirs'))
     for content in (b'other', b'others'):
@@ -288,7 +288,7 @@ def test_a_server_without_if_none_match_overwrites_nothing(
 def test_a_server_that_stops_supporting_if_none_match_overwrites_nothing(
     proved: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
 ) -> None:
-    """One that honoured it until now and says 501 then, once, is asked what it holds before anything is sent without it."""
+    """If one that supported it so far responds with 501 once, existing keys are checked before any put without it."""
     direct.put(spool(key, b'theirs'))
     front.script = Script([Fault.NO_CONDITION])
     with pytest.raises(ForeignObject):
@@ -302,7 +302,7 @@ def test_a_server_that_stops_supporting_if_none_match_overwrites_nothing(
 def test_a_transient_head_failure_quarantines_nothing(
     there: bool, content: bytes, fault: Fault, opened: S3Store, direct: S3Store, front: Front, spool: Spool
 ) -> None:
-    """What asks for the reason may find that all is well by then, with or without the object."""
+    """The check for the reason may succeed by then, with or without the object."""
     item = spool(uuid.uuid4().hex, content)
     direct.put(item if there else spool(uuid.uuid4().hex, content))
     front.script = Script([fault])
@@ -311,9 +311,9 @@ def test_a_transient_head_failure_quarantines_nothing(
 
 @pytest.mark.seaweedfs
 @pytest.mark.long('a second of CPU or more')
-@pytest.mark.filterwarnings('ignore:tzname')  # of half a date
+@pytest.mark.filterwarnings('ignore:tzname')  # in the middle of a date
 def test_a_truncated_answer_quarantines_nothing(proved: S3Store, front: Front, spool: Spool, key: str) -> None:
-    """Wherever the answer about a key that is taken ends, the object is known again, or it is tried again."""
+    """Wherever the response about a taken key is truncated, the object is recognized, or the put is retried."""
     item = spool(key, CONTENT)
     proved.put(item)
     lengths = [0]
@@ -326,7 +326,7 @@ def test_a_truncated_answer_quarantines_nothing(proved: S3Store, front: Front, s
     place = STATUS_LINE
     ends: set[Put | None] = set()
     while place <= lengths[0] or not lengths[0]:
-        front.script = Script([Fault.NONE, Fault.CUT])  # 412, and the look at what is there
+        front.script = Script([Fault.NONE, Fault.CUT])  # 412, and the check of the existing object
         try:
             ends.add(proved.put(item))
         except StoreUnavailable:
@@ -339,9 +339,9 @@ def test_a_truncated_answer_quarantines_nothing(proved: S3Store, front: Front, s
 def test_a_head_that_fails_for_an_unknown_reason_proves_nothing(
     opened: S3Store, direct: S3Store, front: Front, spool: Spool, key: str
 ) -> None:
-    """A clock that is wrong, and a login page where the reason is asked for: this does not say that looking is forbidden.
+    """A wrong clock, and a login page in response to the check: neither means that reading is forbidden.
 
-    A server that overwrites would then lose what somebody else has stored.
+    Otherwise a server that overwrites would lose what another writer has stored.
     """
     again(direct, spool(key, b'of another writer'))
     front.condition = Condition.OVERWRITES

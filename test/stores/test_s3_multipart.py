@@ -1,4 +1,4 @@
-"""Large objects are sent in parts; what ends an upload costs only the parts in flight."""
+"""Large objects are sent in parts; an interruption costs only the parts in flight."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from shadowhound_data_logger.stores.s3 import S3Store
 
 MEBI = 1 << 20
 SMALLEST_PART = 5 * MEBI
-"""The smallest that S3 allows."""
+"""The minimum that S3 allows."""
 CONTENT = os.urandom(2 * SMALLEST_PART + 12345)
 KEY = "thor/rosbags/patrol's(1)+@=/patrol_0.mcap"
 
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is large here is a fraction of a slice."""
+    """Make a fraction of a slice count as large."""
     monkeypatch.setattr(s3_puts, 'MULTIPART_BYTES', SMALLEST_PART)
     monkeypatch.setattr(content, 'PART_BYTES', SMALLEST_PART)
 
@@ -56,13 +56,13 @@ def server(request: pytest.FixtureRequest, opened: Callable[..., S3Store]) -> S3
 
 
 def under_way(store: S3Store, bucket: str) -> list[str]:
-    """The keys of the uploads that are neither completed nor aborted."""
+    """The keys of uploads that are neither completed nor aborted."""
     with store._client.requesting(bucket, '') as client:
         return [upload['Key'] for upload in client.list_multipart_uploads(Bucket=bucket).get('Uploads', ())]
 
 
 def test_a_large_object_is_stored_like_any_other(store: ObjectStore, item: SpooledObject, bucket: str) -> None:
-    """Content, type and metadata make the round trip; the same again is a success."""
+    """Content, type and metadata are returned unchanged; putting the same again succeeds."""
     assert store.put(item) is Put.CREATED
     assert store.get(bucket, KEY) == CONTENT
     info = store.head(bucket, KEY)
@@ -74,7 +74,7 @@ def test_a_large_object_is_stored_like_any_other(store: ObjectStore, item: Spool
 
 
 def test_other_large_content_never_overwrites(store: ObjectStore, item: SpooledObject, spool: Spool, bucket: str) -> None:
-    """It raises ForeignObject before a byte of it is sent."""
+    """It raises ForeignObject before a byte is sent."""
     store.put(item)
     sent = store.pace.sent_bytes
     with pytest.raises(ForeignObject):
@@ -87,7 +87,7 @@ def test_other_large_content_never_overwrites(store: ObjectStore, item: SpooledO
 def test_a_damaged_large_file_is_never_an_object(
     store: ObjectStore, item: SpooledObject, spool: Spool, bucket: str, damage: str
 ) -> None:
-    """Wherever it differs, it is refused before it is anything in the store."""
+    """Wherever it differs, it is refused before it becomes an object."""
     store.put(spool('first', b'makes the bucket'))
     wrong = {'flipped': CONTENT[:-1] + bytes([CONTENT[-1] ^ 1]), 'shorter': CONTENT[:-1], 'longer': CONTENT + b'x'}[damage]
     item.path.write_bytes(wrong)
@@ -100,10 +100,10 @@ def test_a_damaged_large_file_is_never_an_object(
 
 
 def test_memory_is_bounded(request: pytest.FixtureRequest, store: ObjectStore, item: SpooledObject) -> None:
-    """A slice is never in memory as a whole, nor is a part of it."""
+    """Neither a complete slice nor a complete part is ever in memory."""
     if request.node.callspec.id in {'memory', 'moto'}:
         pytest.skip('the store itself is in this memory')
-    store.probe()  # what is imported and opened first is not counted
+    store.probe()  # memory of imports and opening is not counted
     tracemalloc.start()
     store.put(item)
     _, peak = tracemalloc.get_traced_memory()
@@ -112,7 +112,7 @@ def test_memory_is_bounded(request: pytest.FixtureRequest, store: ObjectStore, i
 
 
 def test_a_small_object_is_one_request(server: S3Store, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Up to the limit an object is put as a whole."""
+    """Up to the limit an object is a single put."""
     monkeypatch.setattr(server._puts, '_multipart', None)
     assert server.put(spool('a', CONTENT[:SMALLEST_PART])) is Put.CREATED
     with pytest.raises(AttributeError):
@@ -120,7 +120,7 @@ def test_a_small_object_is_one_request(server: S3Store, spool: Spool, bucket: st
 
 
 def test_parts_that_are_there_are_not_sent_again(server: S3Store, item: SpooledObject, bucket: str) -> None:
-    """A try that ended after two parts is taken up by another store, which sends the third alone."""
+    """After a try that ended with two parts another store continues, and sends only the third."""
     server.put(replace(item, key='other'))
     uploads = server._puts._multipart._uploads
     upload = uploads.begin(item)
@@ -135,7 +135,7 @@ def test_parts_that_are_there_are_not_sent_again(server: S3Store, item: SpooledO
 
 
 def test_an_upload_of_other_content_is_aborted(server: S3Store, item: SpooledObject, spool: Spool, bucket: str) -> None:
-    """So is one without a part: neither may lend its metadata to ours, and both would take room for ever."""
+    """So is one without a part: neither may provide the metadata of ours, and both would use space permanently."""
     server.put(replace(item, key='other'))
     uploads = server._puts._multipart._uploads
     other = spool(KEY, CONTENT[::-1])
@@ -151,13 +151,13 @@ def test_an_upload_of_other_content_is_aborted(server: S3Store, item: SpooledObj
 
 
 def test_a_key_of_another_writer_is_not_overwritten(server: S3Store, item: SpooledObject, spool: Spool, bucket: str) -> None:
-    """Whoever wrote it while the parts were sent was first; ours leaves nothing behind."""
+    """An object written while the parts were sent was first; ours leaves nothing behind."""
     theirs = spool(KEY, b'theirs')
     looks = []
 
     def poll() -> bool:
         looks.append(server.put(theirs))
-        return False  # and the server has the last word
+        return False  # and the server decides
 
     server.put(spool('a', b'x'))
     assert not server._puts._multipart.put(item, poll)
@@ -169,7 +169,7 @@ def test_a_key_of_another_writer_is_not_overwritten(server: S3Store, item: Spool
 
 
 def test_no_file_has_more_parts_than_s3_allows() -> None:
-    """From 80 GB on the parts grow."""
+    """Above 80 GB the parts grow."""
     for size in (1, 100 * MEBI, content.MAX_PARTS * content.PART_BYTES, 1 << 40, (1 << 40) + 1):
         step = content.part_bytes(size)
         assert step >= content.PART_BYTES
@@ -177,7 +177,7 @@ def test_no_file_has_more_parts_than_s3_allows() -> None:
 
 
 def test_a_part_can_be_read_twice(tmp_path: Path) -> None:
-    """Whoever sends it again begins anew; it never reads beyond its end."""
+    """A second read starts at the beginning again; it never reads beyond its end."""
     path = tmp_path / 'file'
     path.write_bytes(bytes(range(100)))
     with path.open('rb') as file:
@@ -191,7 +191,7 @@ BUCKET = 'slices'
 PART = 5 << 20
 SLICE_BYTES = os.urandom(2 * PART + 999)
 BEFORE = ('look', 'list', 'begin')
-"""The requests before the first part; three parts follow, a look and the end."""
+"""The requests before the first part; then three parts, a check and the completion."""
 REQUESTS = (*BEFORE, 'part 1', 'part 2', 'part 3', 'look again', 'complete')
 TOOK_IT = {Fault.CUT, Fault.ACK_LOST}
 TEST = Path(__file__).parents[1]
@@ -204,7 +204,7 @@ def front(seaweed: Tower) -> Iterator[Front]:
 
 
 def new_store(seaweed: Tower, front: Front, *, read_timeout_s: float = 20.0) -> S3Store:
-    """As a process that begins."""
+    """As a new process."""
     store = S3Store(replace(seaweed.store_settings(), endpoint_url=front.url), UploadSettings(read_timeout_s=read_timeout_s))
     store.open()
     return store
@@ -224,7 +224,7 @@ def slice_item(tmp_path: Path) -> SpooledObject:
 
 
 def taken(front: Front, slice_item: SpooledObject) -> list[int]:
-    """Numbers of the parts that the server took, in order, repeats among them."""
+    """Numbers of the parts that the server accepted, in order, including repeats."""
     found = [(urlsplit(path), len(hashes)) for path, hashes in front.stored.items()]
     path = f'/{BUCKET}/{slice_item.key}'
     numbers = [(parse_qs(url.query).get('partNumber'), count) for url, count in found if url.path == path]
@@ -232,7 +232,7 @@ def taken(front: Front, slice_item: SpooledObject) -> list[int]:
 
 
 def delivered(behind_front: S3Store, slice_item: SpooledObject) -> Put:
-    """Put until it works."""
+    """Put until it succeeds."""
     ends: list[Put] = []
 
     def works() -> bool:
@@ -263,7 +263,7 @@ MORE = pytest.mark.long('more faults at more requests')
 def test_a_fault_at_any_request_costs_only_parts_in_flight(
     behind_front: S3Store, front: Front, seaweed: Tower, slice_item: SpooledObject, fault: Fault, request_name: str
 ) -> None:
-    """The next try ends it; of the parts none is taken twice, and no upload is left."""
+    """The next try completes it; no part is accepted twice, and no upload is left."""
     before = REQUESTS.index(request_name)
     front.script = Script([*[Fault.NONE] * before, fault])
     with pytest.raises(StoreError):
@@ -272,7 +272,7 @@ def test_a_fault_at_any_request_costs_only_parts_in_flight(
     done = before - len(BEFORE) + (fault in TOOK_IT)
     assert taken(front, slice_item) == list(range(1, min(max(done, 0), 3) + 1))
     sent = behind_front.pace.sent_bytes
-    again = new_store(seaweed, front)  # as after a restart: all that is known is what the server tells
+    again = new_store(seaweed, front)  # as after a restart: only the server's state is known
     try:
         end = again.put(slice_item)
         assert end is (Put.IDENTICAL if (request_name, fault) == ('complete', Fault.ACK_LOST) else Put.CREATED)
@@ -293,7 +293,7 @@ def test_a_fault_at_any_request_costs_only_parts_in_flight(
 def test_a_permanent_fault_costs_only_parts_in_flight(
     behind_front: S3Store, front: Front, slice_item: SpooledObject, fault: Fault
 ) -> None:
-    """With the same fault at every third request it gets there, whole and once."""
+    """With the same fault at every third request it completes, correctly and once."""
     front.script = Script([fault if number % 3 == 2 else Fault.NONE for number in range(14)])
     assert delivered(behind_front, slice_item) in {Put.CREATED, Put.IDENTICAL}
     until(lambda: front.is_quiet)
@@ -306,7 +306,7 @@ def test_a_permanent_fault_costs_only_parts_in_flight(
 def test_a_server_that_hangs_in_a_part_costs_that_part(
     behind_front: S3Store, front: Front, seaweed: Tower, slice_item: SpooledObject
 ) -> None:
-    """It is given up after the timeout, and the parts before it stay."""
+    """The part is abandoned after the timeout, and the earlier ones stay."""
     front.script = Script([*[Fault.NONE] * (len(BEFORE) + 1), Fault.HUNG])
     impatient = new_store(seaweed, front, read_timeout_s=0.5)
     try:
@@ -323,7 +323,7 @@ def test_a_server_that_hangs_in_a_part_costs_that_part(
 def test_a_kill_between_parts_resumes_the_upload(
     behind_front: S3Store, front: Front, seaweed: Tower, slice_item: SpooledObject
 ) -> None:
-    """A process that dies with two of three parts delivered leaves its successor the third."""
+    """After a process was killed with two of three parts delivered, its successor only sends the third."""
     program = f"""
 from pathlib import Path, PosixPath
 from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
@@ -338,7 +338,7 @@ store.put({slice_item!r})
     path = os.pathsep.join((str(TEST.parent), os.environ.get('PYTHONPATH', '')))
     environment = {**os.environ, **seaweed.environment(), 'PYTHONPATH': path}
     with subprocess.Popen([sys.executable, '-c', program], env=environment) as process:
-        until(lambda: script.counts[Fault.HUNG] or process.poll() is not None)  # the third part has come, and goes no further
+        until(lambda: script.counts[Fault.HUNG] or process.poll() is not None)  # the third part has arrived, but is not forwarded
         process.send_signal(signal.SIGKILL)
     assert taken(front, slice_item) == [1, 2]
     front.script = Script()

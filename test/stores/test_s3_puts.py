@@ -1,4 +1,4 @@
-"""An S3 store never overwrites, whatever its server makes of If-None-Match; how bodies are sent under a cap."""
+"""An S3 store never overwrites, however its server handles If-None-Match; how bodies are sent under a cap."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from shadowhound_data_logger.stores.s3_puts import LOOK_FIRST_BYTES
 def test_a_server_without_conditional_puts_overwrites_nothing(
     condition: str, words: str, opened: Callable[..., S3Store], spool: Spool, bucket: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Where If-None-Match does not work, be it admitted or not, each put looks first, and one warning says so."""
+    """If If-None-Match does not work, reported or not, each put checks first, with one warning."""
     with served(FakeS3(condition=condition)) as server, caplog.at_level(logging.WARNING):
         store = opened(server.url)
         assert store.put(spool('a', b'first')) is Put.CREATED
@@ -41,7 +41,7 @@ def test_a_server_without_conditional_puts_overwrites_nothing(
 
 
 def test_the_very_first_put_never_overwrites(opened: Callable[..., S3Store], spool: Spool, bucket: str) -> None:
-    """A server that ignores If-None-Match is found out without a loss."""
+    """A server that ignores If-None-Match is detected without a loss."""
     with served(FakeS3(condition='ignored')) as server:
         server.objects[f'/{bucket}/a'] = (b'theirs', {})
         error_of(ForeignObject, lambda: opened(server.url).put(spool('a', b'ours..')))
@@ -49,7 +49,7 @@ def test_the_very_first_put_never_overwrites(opened: Callable[..., S3Store], spo
 
 
 def test_a_verified_server_costs_one_request_per_put(opened: Callable[..., S3Store], spool: Spool) -> None:
-    """The proof costs two requests once."""
+    """Verification takes two requests, once."""
     with served(FakeS3()) as server:
         store = opened(server.url)
         for key in ('a', 'b', 'c'):
@@ -59,9 +59,9 @@ def test_a_verified_server_costs_one_request_per_put(opened: Callable[..., S3Sto
 
 @pytest.mark.parametrize('condition', ['honoured', 'ignored'])
 def test_the_loser_of_a_race_is_told(condition: str, opened: Callable[..., S3Store], spool: Spool, bucket: str) -> None:
-    """A server lets two creates of one instant through, with different content: the one whose content is there has created it.
+    """A server accepts two simultaneous creates with different content: the one whose content is stored has created it.
 
-    The other finds a foreign object, as it does where it comes later. Each had met objects of the other before.
+    The other gets ForeignObject, as it would if it came later. Each has met objects of the other before.
     """
     with served(FakeS3(condition=condition)) as server, ThreadPoolExecutor(2) as pool:
         ours, theirs = opened(server.url), opened(server.url)
@@ -81,7 +81,7 @@ def test_the_loser_of_a_race_is_told(condition: str, opened: Callable[..., S3Sto
 
 
 def test_credentials_that_can_only_write_suffice(opened: Callable[..., S3Store], spool: Spool) -> None:
-    """They can write to a server that honours the condition, and to no other."""
+    """With a server that supports the condition, and no other."""
     with served(FakeS3()) as server:
         server.forbid_head = True
         store = opened(server.url)
@@ -99,7 +99,7 @@ def test_credentials_that_can_only_write_suffice(opened: Callable[..., S3Store],
 def test_an_object_without_our_metadata_is_compared_by_content(
     content: bytes, kind: type[StoreError] | None, opened: Callable[..., S3Store], spool: Spool, bucket: str
 ) -> None:
-    """What somebody copied there by hand is recognized, and what is foreign stays."""
+    """A copy made by hand is recognized, and foreign content stays."""
     with served(FakeS3()) as server:
         server.objects[f'/{bucket}/a'] = (content, {})
         store = opened(server.url)
@@ -110,7 +110,7 @@ def test_an_object_without_our_metadata_is_compared_by_content(
 
 
 class Wire(ThreadingHTTPServer):
-    """An S3 look-alike that notes when how much of a body arrives."""
+    """An imitation of S3 that records when the bytes of a body arrive."""
 
     daemon_threads = True
 
@@ -119,13 +119,13 @@ class Wire(ThreadingHTTPServer):
         self.arrivals: list[tuple[float, int]] = []
         self.broken = 0
         self.answers: list[int] = []
-        """Statuses of the next PUTs; then 200, or 412 for a key that is there."""
+        """Statuses of the next PUTs; then 200, or 412 for an existing key."""
         self.is_full = False
-        """Whether it holds other content under every key."""
+        """Whether it has other content under every key."""
         self.keys: set[str] = set()
 
     def handle_error(self, *_: object) -> None:
-        """A client that went away is not an error of ours."""
+        """Ignore clients that disconnected."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -188,7 +188,7 @@ def opened(wire: Wire, max_mbps: float = 0.0, timeout_s: float = 5.0) -> S3Store
 
 @pytest.fixture
 def proved(wire: Wire, spool: Spool) -> Iterator[S3Store]:
-    """A store that knows its server, with nothing on record yet."""
+    """A store that has verified its server, with an empty record."""
     store = opened(wire)
     store.put(spool('first', b'first'))
     wire.arrivals.clear()
@@ -197,7 +197,7 @@ def proved(wire: Wire, spool: Spool) -> Iterator[S3Store]:
 
 
 def test_a_body_arrives_evenly_and_outlasts_every_timeout(wire: Wire, spool: Spool, proved: S3Store) -> None:
-    """Timeouts are over single pieces; nothing arrives sooner than the cap allows, neither at the beginning nor after a pause."""
+    """Timeouts apply to single pieces; nothing arrives sooner than the cap allows, neither at the start nor after a pause."""
     proved.close()
     timeout_s, cap, size = 1.0, 1.0, 300_000
     rate = cap * BYTES_PER_MEGABIT
@@ -206,17 +206,17 @@ def test_a_body_arrives_evenly_and_outlasts_every_timeout(wire: Wire, spool: Spo
     store.put(spool('large', bytes(size)))
     store.close()
     arrived = 0
-    for moment, count in wire.arrivals[: len(wire.arrivals) // 2]:  # the rest is the proof: the same again
+    for moment, count in wire.arrivals[: len(wire.arrivals) // 2]:  # the rest is the verification: the same again
         arrived += count
-        assert arrived <= rate * (moment - began + LATE_S + PIECE_S)  # the first piece leaves at once
+        assert arrived <= rate * (moment - began + LATE_S + PIECE_S)  # the first piece is sent immediately
     assert wire.arrivals[-1][0] - began > 2 * timeout_s
     assert store.pace.sent_bytes == 2 * size
 
 
 def test_sent_bytes_are_counted_as_they_are_sent(wire: Wire, spool: Spool, proved: S3Store) -> None:
-    """Bodies of every try, no reading for a checksum or a signature, nothing of a server that was never reached."""
+    """Bodies of every try, but not reads for a checksum or a signature, nor data for an unreachable server."""
     counted = proved.pace.sent_bytes
-    assert counted == 2 * len(b'first')  # the put, and the proof that it cannot be repeated
+    assert counted == 2 * len(b'first')  # the put, and the check that it cannot be repeated
     wire.answers = [503]
     item = spool('again', bytes(100_000))
     with pytest.raises(StoreUnavailable):
@@ -240,7 +240,7 @@ def test_a_body_of_any_size_arrives(wire: Wire, spool: Spool, proved: S3Store, s
 
 @pytest.mark.parametrize('max_mbps', [0.0, 0.1])
 def test_a_refused_large_body_is_not_sent(wire: Wire, spool: Spool, proved: S3Store, max_mbps: float) -> None:
-    """The server says so before anything of it left, and nothing of it counts: it takes none of the time under a cap."""
+    """The server refuses before any byte is sent, and nothing counts: it uses no time under a cap."""
     wire.is_full = True
     proved.pace.set(max_mbps)
     counted, began = proved.pace.sent_bytes, time.monotonic()
@@ -248,11 +248,11 @@ def test_a_refused_large_body_is_not_sent(wire: Wire, spool: Spool, proved: S3St
         proved.put(spool('there', bytes(4 * LOOK_FIRST_BYTES)))
     assert wire.arrivals == []
     assert proved.pace.sent_bytes == counted
-    assert time.monotonic() - began < 60.0  # at this cap it would be 84 s
+    assert time.monotonic() - began < 60.0  # at this cap it would take 84 s
 
 
 def test_a_cancelled_put_ends_immediately(wire: Wire, spool: Spool, proved: S3Store) -> None:
-    """At once, and the server sees it: no half body can be taken for a whole one."""
+    """The server notices: no partial body can be mistaken for a complete one."""
     proved.pace.set(0.01)
     failed: list[Exception] = []
 
@@ -274,7 +274,7 @@ def test_a_cancelled_put_ends_immediately(wire: Wire, spool: Spool, proved: S3St
 
 
 def test_a_new_cap_applies_to_the_current_body(wire: Wire, spool: Spool, proved: S3Store) -> None:
-    """An operator who gives the radio free sees it at once."""
+    """When an operator lifts the cap it takes effect immediately."""
     proved.pace.set(0.01)
     thread = threading.Thread(target=proved.put, args=(spool('slow', bytes(500_000)),))
     thread.start()

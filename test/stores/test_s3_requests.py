@@ -30,7 +30,7 @@ from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 
 
 def test_botocore_does_not_import_pyopenssl() -> None:
-    """Which it loads where the live page's extra has brought it, and does without as well."""
+    """It would if the extra of the live page has installed it, and works without it."""
     pytest.importorskip('OpenSSL')
     program = (
         'import sys\n'
@@ -51,7 +51,7 @@ UPLOAD = UploadSettings()
 
 
 def answer(status: str, told: str, size: int) -> bytes:
-    """An answer about ``told`` that has ``size`` bytes."""
+    """A response that declares ``told`` and has ``size`` bytes."""
     headers = f'HTTP/1.1 {status}\r\nETag: "x"\r\nContent-Range: {told}\r\nContent-Length: {size}\r\n'
     return f'{headers}Last-Modified: Sat, 21 Nov 2026 12:00:00 GMT\r\nConnection: close\r\n\r\n'.encode() + bytes(size)
 
@@ -65,21 +65,21 @@ def test_a_range_reads_at_most_the_requested_bytes(opened: Callable[..., S3Store
 
 
 def test_an_object_reads_at_most_its_size(opened: Callable[..., S3Store]) -> None:
-    """It says that it has ten bytes, and sends megabytes."""
+    """It declares ten bytes, and sends megabytes."""
     sent = answer('200 OK', 'bytes 0-9/10', MORE)
     with resetting(sent, reset=False) as url, pytest.raises(ObjectRefused, match='more than 10 bytes'):
         opened(url).get('camera', 'a', 10)
 
 
 def test_the_rest_of_an_object_comes_in_bounded_pieces() -> None:
-    """Also where the server sends more than the rest that it tells of."""
+    """Also if the server sends more than the declared rest."""
     with resetting(answer('206 Partial Content', 'bytes 4-9/10', MORE), reset=False) as url:
         content = open_reader(settings_for(url)).content('camera', 'a', 4)
         assert all(len(piece) <= 2 * CHUNK_BYTES for piece in content)
 
 
 def test_a_download_stops_at_the_announced_size(tmp_path: Path) -> None:
-    """A store that never ends fills no disk."""
+    """A store that sends endlessly fills no disk."""
 
     class Endless(MemoryStore):
         sent = 0
@@ -133,7 +133,7 @@ class _Page(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
-        """Quiet."""
+        """Log nothing."""
 
 
 @contextmanager
@@ -150,7 +150,7 @@ def pages(fails: int) -> Iterator[tuple[Pages, StoreSettings]]:
 
 
 def test_a_listing_resumes_at_the_failed_page() -> None:
-    """Over a bad link a long listing would never end if it began anew each time."""
+    """Over a bad link a long listing would never finish if it restarted each time."""
     with pages(fails=1) as (server, settings):
         found = Bucket(settings, 'camera').list('robot/')
     assert [entry.key for entry in found] == [f'robot/{number:05}' for number in range(3 * PAGE)]
@@ -159,19 +159,19 @@ def test_a_listing_resumes_at_the_failed_page() -> None:
 
 @pytest.mark.parametrize('url', ['nonsense', 'http://', 'http://127.0.0.1:1:2', 'ftp://tower', 'http://[::1', 'http://a b', ''])
 def test_an_unusable_endpoint_is_an_invalid_setting(url: str) -> None:
-    """Instead of a panic of the library."""
+    """Instead of a panic in the library."""
     with pytest.raises(SettingError, match='AWS_ENDPOINT_URL'):
         ObstoreStore(StoreSettings(endpoint_url=url, access_key_id='x', secret_access_key='y'), UPLOAD).open()
 
 
 @pytest.mark.parametrize('url', ['http://tower:9000', 'https://s3.example.org', 'http://[fe80::1]:9000', 'http://10.0.0.2/s3/'])
 def test_a_usable_endpoint_is_accepted(url: str) -> None:
-    """A host or an address, with a port and a path or without."""
+    """A host name or an address, with or without a port and a path."""
     ObstoreStore(settings_for(url), UPLOAD).open()
 
 
 def test_a_password_in_the_endpoint_is_not_shown() -> None:
-    """Neither by the reader nor by a bucket of it."""
+    """Neither by the reader nor by one of its buckets."""
     with refused() as url:
         settings = settings_for(url.replace('http://', 'http://user:hunter2@'))
         reader = open_reader(settings)
@@ -183,7 +183,7 @@ def test_a_password_in_the_endpoint_is_not_shown() -> None:
 
 
 def test_the_memory_of_many_buckets_is_bounded() -> None:
-    """The rows of a catalog name the buckets, whoever wrote those."""
+    """Buckets are named by rows of a catalog, which any writer may have added."""
     with refused() as url:
         store = ObstoreStore(settings_for(url), UPLOAD)
         for number in range(40):

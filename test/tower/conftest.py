@@ -1,4 +1,4 @@
-"""A server whose users are those that they make."""
+"""A server with the users created by make_secrets.py."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PORTS: Final = (9000, 5001, 5432, 9333, 8080, 8888)
 
 @pytest.fixture(scope='module')
 def offset() -> int:
-    """Something to add to all ports so that none of them is taken."""
+    """An offset for all ports so that none of them is taken."""
     for number in random.sample(range(500, 3000), 50):
         sockets = [socket.socket() for _ in PORTS]
         try:

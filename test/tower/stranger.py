@@ -1,6 +1,6 @@
-"""Somebody who reaches a Tower and holds nothing: knocks at ports and calls gRPC methods, in a process of its own.
+"""A client of a Tower without credentials: connects to ports and calls gRPC methods, in a separate process.
 
-Reads from its standard input what to do, as JSON, and writes what came of it: ``{"connect": [[host, port]], "call": [[host, port,
+Reads its tasks from standard input, as JSON, and writes the results: ``{"connect": [[host, port]], "call": [[host, port,
 method, request in hex]]}``. gRPC's threads and its handling of forks stay out of the tests' process that way.
 """
 
@@ -16,7 +16,7 @@ from typing import Final
 
 PATIENCE_S: Final = 5.0
 REFLECTION: Final = '/grpc.reflection.v1.ServerReflection/ServerReflectionInfo'
-"""Tells what a server offers: https://github.com/grpc/grpc/blob/master/doc/server-reflection.md."""
+"""Lists the services of a server: https://github.com/grpc/grpc/blob/master/doc/server-reflection.md."""
 Call = tuple[str, int, str, bytes]
 """Host, port, method and request."""
 Answer = tuple[str, bytes]
@@ -24,19 +24,19 @@ Answer = tuple[str, bytes]
 
 
 def ask(calls: Sequence[Call], namespace: str = '') -> list[Answer]:
-    """The answers, in order; from another network namespace where one is named."""
+    """The responses, in order; from another network namespace if given."""
     told = _run({'call': [[host, port, method, body.hex()] for host, port, method, body in calls]}, namespace)['call']
     return [(str(status), bytes.fromhex(message)) for status, message in told]
 
 
 def reach(host: str, ports: Sequence[int], namespace: str = '') -> set[int]:
-    """The ports that take a connection."""
+    """The ports that accept a connection."""
     told = _run({'connect': [[host, port] for port in ports]}, namespace)['connect']
     return {port for port, taken in zip(ports, told, strict=True) if taken}
 
 
 def methods(host: str, port: int) -> list[str]:
-    """All that a server offers, by its own account: ``/package.Service/Method``."""
+    """All methods that a server offers, by reflection: ``/package.Service/Method``."""
     ((status, listed),) = ask([(host, port, REFLECTION, field(7, b''))])
     assert status == 'OK', status
     services = [dict(fields(service))[1] for _, service in fields(dict(fields(listed))[6])]

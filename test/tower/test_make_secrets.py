@@ -1,4 +1,4 @@
-"""The secrets of a Tower and their rotation, also while a robot works with its own keys over TLS."""
+"""The secrets of a Tower and their rotation, also while a robot uses its keys over TLS."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from shadowhound_data_logger.stores.s3 import S3Store
 
 
 def _modes(folder: Path) -> set[str]:
-    """Of the files with secrets: all but the digests."""
+    """The modes of the files with secrets: all except the digests."""
     files = {path for path in folder.rglob('*') if path.is_file()} - {folder / 'mlflow' / 'users.json'}
     return {oct(stat.S_IMODE(path.stat().st_mode)) for path in files}
 
@@ -38,7 +38,7 @@ def _key(folder: Path, user: str) -> str:
 
 
 def test_only_their_owner_can_read_them(tmp_path: Path) -> None:
-    """Every file has mode 600 and the folder 700, whatever the umask; but for the digests, which tell nobody a password."""
+    """Every file has mode 600 and the folder 700, with any umask; except the digests, which reveal no password."""
     code = 'import os, sys; os.umask(0); sys.path.insert(0, sys.argv[1]); import make_secrets; make_secrets.main(sys.argv[2:])'
     subprocess.run([sys.executable, '-c', code, str(TOWER), '--folder', str(tmp_path)], check=True, capture_output=True)
     digests = tmp_path / 'mlflow' / 'users.json'
@@ -65,7 +65,7 @@ def test_existing_secrets_are_kept(tmp_path: Path) -> None:
 
 
 def test_the_files_of_users_name_the_ports_of_their_tower(tmp_path: Path) -> None:
-    """Also when a key is changed later; a Tower at the usual ports gets these back."""
+    """Also if a key is changed later; a Tower at the default ports gets these back."""
     make_secrets.make(tmp_path, '192.168.1.10', ['thor'], offset=1000)
     make_secrets.make(tmp_path, None, [], rotate=['thor'])
     thor = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
@@ -76,7 +76,7 @@ def test_the_files_of_users_name_the_ports_of_their_tower(tmp_path: Path) -> Non
 
 
 def test_missing_secrets_are_added(tmp_path: Path) -> None:
-    """The signing keys and the certificate of SeaweedFS are added, once, beside keys and passwords that stay."""
+    """The signing keys and the certificate of SeaweedFS are added, once, without changing existing keys and passwords."""
     make_secrets.make(tmp_path, '192.168.1.10', ['thor'])
     for path in (tmp_path / 'secrets').glob('se*.*'):
         path.unlink()
@@ -95,7 +95,7 @@ def test_missing_secrets_are_added(tmp_path: Path) -> None:
 def test_a_missing_openssl_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing is left half made: the next run begins anew."""
+    """No incomplete file is left: the next run starts again."""
     with monkeypatch.context() as patch:
         patch.setenv('PATH', str(tmp_path))
         assert make_secrets.main(['--folder', str(tmp_path)]) == 2
@@ -105,7 +105,7 @@ def test_a_missing_openssl_is_reported(
 
 
 def test_no_secret_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What the script prints holds no key and no password."""
+    """The script's output contains no key and no password."""
     assert make_secrets.main(['--folder', str(tmp_path)]) == 0
     printed = ''.join(capsys.readouterr())
     settings = make_secrets.read_env(tmp_path / '.env')
@@ -116,7 +116,7 @@ def test_no_secret_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_a_key_is_rotated_without_a_gap(tmp_path: Path) -> None:
-    """Rotating adds a key in front of the old one, which goes when it is retired; other users keep theirs."""
+    """Rotating adds a key before the old one, which is removed when it is retired; other users keep theirs."""
     make_secrets.make(tmp_path, None, ['thor'])
     old, spark = _key(tmp_path, 'thor'), _key(tmp_path, 'spark')
     make_secrets.make(tmp_path, None, [], rotate=['thor'])
@@ -130,7 +130,7 @@ def test_a_key_is_rotated_without_a_gap(tmp_path: Path) -> None:
 
 
 def test_a_password_of_mlflow_is_changed_with_the_keys(tmp_path: Path) -> None:
-    """The new one beside the old one until that is retired; the server's own user of S3 has none."""
+    """The new one is valid next to the old one until that is retired; the server's S3 user has none."""
     make_secrets.make(tmp_path, None, ['thor'])
     old = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')['MLFLOW_TRACKING_PASSWORD']
     make_secrets.make(tmp_path, None, [], rotate=['thor'])
@@ -146,7 +146,7 @@ def test_a_password_of_mlflow_is_changed_with_the_keys(tmp_path: Path) -> None:
 
 
 def test_missing_passwords_are_added(tmp_path: Path) -> None:
-    """Its keys stay, and S3 knows nothing of passwords."""
+    """The keys are unchanged, and S3 has no passwords."""
     make_secrets.make(tmp_path, None, ['thor'])
     path = tmp_path / 'secrets' / 'users.json'
     before = {user: [{name: key[name] for name in ('accessKey', 'secretKey')} for key in keys]
@@ -162,7 +162,7 @@ def test_missing_passwords_are_added(tmp_path: Path) -> None:
 
 
 def test_a_file_of_keys_is_the_environment_of_its_user(tmp_path: Path) -> None:
-    """The same pair is read from it by botocore, the newest; and by MLflow's clients, as ~/.mlflow/credentials, its password."""
+    """The newest pair, which botocore reads from it; MLflow's clients read its password, as ~/.mlflow/credentials."""
     make_secrets.make(tmp_path, None, ['thor'])
     make_secrets.make(tmp_path, None, [], rotate=['thor'])
     found = raw_config_parse(str(tmp_path / 'secrets' / 'thor.credentials'))['default']
@@ -176,7 +176,7 @@ def test_a_file_of_keys_is_the_environment_of_its_user(tmp_path: Path) -> None:
 
 
 def test_a_certificate_makes_the_addresses_https(tmp_path: Path) -> None:
-    """And names the authority to both clients; without one there is neither."""
+    """And the file has the CA for both clients; without a certificate there is neither."""
     make_secrets.make(tmp_path, None, ['thor'])
     plain = make_secrets.read_env(tmp_path / 'secrets' / 'thor.env')
     (tmp_path / 'tls').mkdir()
@@ -189,7 +189,7 @@ def test_a_certificate_makes_the_addresses_https(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('name', ['../thor', 'thor*', 'Thor', '', 'a b', '-x'])
 def test_a_name_that_is_a_pattern_is_refused(tmp_path: Path, name: str) -> None:
-    """A robot's name becomes part of what it may do: no wildcard and no path gets in."""
+    """A robot's name becomes part of its permissions: no wildcard and no path is accepted."""
     with pytest.raises(make_secrets.Refused):
         make_secrets.make(tmp_path, None, [name])
     assert make_secrets.main(['--folder', str(tmp_path), '--rotate', 'nobody']) == 2
@@ -204,7 +204,7 @@ PARAMETERS = {
 
 
 def certified(folder: Path) -> None:
-    """Follow the manual, but for the address and the folder."""
+    """Follow the manual, except for the address and the folder."""
     text = MANUAL.read_text(encoding='utf-8')
     section = text[text.index('\n## TLS') :]
     lines = re.search(r'((?:    .*\n)+)', section)
@@ -215,7 +215,7 @@ def certified(folder: Path) -> None:
 
 @pytest.fixture
 def tower(tmp_path: Path, offset: int) -> Iterator[Path]:
-    """The folder of a Tower behind TLS that runs."""
+    """The folder of a running Tower with TLS."""
     folder = tmp_path / 'tower'
     folder.mkdir()
     certified(folder)
@@ -239,7 +239,7 @@ def processes(tmp_path: Path) -> Iterator[Processes]:
 
 
 def environment(folder: Path, user: str, offset: int) -> dict[str, str]:
-    """Of the file that the Tower wrote, with the authority where it is here."""
+    """The variables in the file that the Tower wrote, with the CA's location here."""
     found: dict[str, str] = make_secrets.read_env(folder / 'secrets' / f'{user}.env')
     assert found['AWS_ENDPOINT_URL'].endswith(f':{9000 + offset}')
     assert found['MLFLOW_TRACKING_URI'].endswith(f':{5001 + offset}')
@@ -247,7 +247,7 @@ def environment(folder: Path, user: str, offset: int) -> dict[str, str]:
 
 
 def rotate(folder: Path, file: Path, secrets: list[str]) -> None:
-    """As docs/tower.md says; the old key is refused from here on."""
+    """As in docs/tower.md; the old key is refused from here on."""
     make_secrets.make(folder, None, [], rotate=['thor'])
     reload_s3(folder)
     new = folder / 'secrets' / 'thor.credentials'
@@ -261,7 +261,7 @@ def rotate(folder: Path, file: Path, secrets: list[str]) -> None:
 
 
 def everything(environ: dict[str, str]) -> list[str]:
-    """All keys below the robot's name, by one who may list."""
+    """All keys below the robot's name, listed by a user with permission."""
     settings = StoreSettings(endpoint_url=environ['AWS_ENDPOINT_URL'], access_key_id=environ['AWS_ACCESS_KEY_ID'],
                              secret_access_key=environ['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
     with closing(S3Store(settings, UploadSettings())) as store:
@@ -276,7 +276,7 @@ def everything(environ: dict[str, str]) -> list[str]:
 def test_a_robot_works_with_its_own_keys_during_rotations(
     tower: Path, offset: int, processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Sensors, a mission, a bag and the catalog arrive; two rotations meanwhile lose and quarantine nothing."""
+    """Sensors, a mission, a bag and the catalog arrive; two rotations in between lose and quarantine nothing."""
     environ = environment(tower, 'thor', offset)
     secrets = [environ.pop('AWS_SECRET_ACCESS_KEY'), environ.pop('MLFLOW_TRACKING_PASSWORD')]
     del environ['AWS_ACCESS_KEY_ID'], environ['MLFLOW_TRACKING_USERNAME']

@@ -27,12 +27,12 @@ from shadowhound_tower.embedded import Tower
 
 pytestmark = pytest.mark.seaweedfs
 API = ('/api/2.0/mlflow', '/api/2.0/preview/mlflow', '/ajax-api/2.0/mlflow', '/ajax-api/2.0/preview/mlflow')
-"""Under which MLflow serves, or has served, the same."""
+"""Prefixes of the same API in current and older versions of MLflow."""
 
 
 @dataclass
 class User:
-    """What somebody sends to MLflow; ``name`` is empty for a stranger."""
+    """A client of MLflow; ``name`` is empty for a stranger."""
 
     tower: Tower
     name: str = ''
@@ -56,7 +56,7 @@ class User:
         return int(self.send(method, path, body).status)
 
     def call(self, method: str, path: str, body: Any = None) -> dict[str, Any]:
-        """Something that has to go well."""
+        """A request that must succeed."""
         answer = self.send(method, f'/api/2.0/mlflow/{path}', body)
         assert answer.status == 200, answer.data
         found: dict[str, Any] = answer.json()
@@ -80,7 +80,7 @@ def users(tower: Tower) -> Iterator[dict[str, User]]:
 
 @pytest.fixture(scope='module')
 def run(users: dict[str, User]) -> dict[str, Any]:
-    """One of thor's, with an artifact."""
+    """A run of thor's, with an artifact."""
     made = users['thor'].run(users['thor'].experiment('thor_missions'))
     assert users['thor'].status('PUT', _artifact(made), b'frame') == 200
     return made
@@ -118,7 +118,7 @@ DOORS = [
 
 @pytest.mark.parametrize('name', ['', 'nobody', 'mlflow', 'thor'])
 def test_without_a_password_nothing_is_accessible(users: dict[str, User], tower: Tower, name: str) -> None:
-    """A stranger, a user that is none and a user with the wrong password get 401 or 403 of everything but the health."""
+    """A stranger, an unknown user and a user with a wrong password get 401 or 403 for everything except the health check."""
     user = User(tower, name, users[''].http, password='guess')
     opened = {(method, path): status for method, path in DOORS
               if (status := user.status(method, path, b'{}' if method != 'GET' else None)) not in {401, 403}}  # fmt: skip
@@ -131,7 +131,7 @@ def test_without_a_password_nothing_is_accessible(users: dict[str, User], tower:
     'method', ['Bearer x', 'Basic', 'Basic !!!', 'Basic ' + base64.b64encode(b'tower').decode(), 'Digest username=tower']
 )
 def test_an_incomplete_login_is_rejected(tower: Tower, users: dict[str, User], method: str) -> None:
-    """Whatever else may be in the header."""
+    """Whatever else is in the header."""
     for path in ('/api/2.0/mlflow/experiments/search', '/api/2.0/mlflow-artifacts/artifacts/1/a', '/ajax-api/3.0/jobs/search'):
         answer = users[''].http.request('GET', tower.tracking_uri + path, headers={'Authorization': method}, timeout=60)
         assert answer.status == 401, path
@@ -141,14 +141,14 @@ def test_an_incomplete_login_is_rejected(tower: Tower, users: dict[str, User], m
 @pytest.mark.parametrize('path', ['/api/2.0/mlflow/runs/create', '/health', '/', '/static-files/x', '/nowhere', '/v1/traces',
                                   '/api/2.0/mlflow-artifacts/artifacts/1/x'])  # fmt: skip
 def test_the_body_of_a_stranger_is_not_read(tower: Tower, path: str, told: tuple[str, str]) -> None:
-    """It would fill the memory of the server: the answer comes before anything of the body is sent."""
+    """It would fill the memory of the server: the response is sent before any of the body."""
     for method in ('POST', 'PUT'):
         answer = _without_body(tower, method, path, dict([told]))
         assert (answer.status, answer.headers['WWW-Authenticate']) == (401, 'Basic realm="Tower"'), method
 
 
 def test_the_body_of_a_user_has_a_bound(users: dict[str, User], run: dict[str, Any], tower: Tower) -> None:
-    """But for artifacts, which are streamed."""
+    """Except for artifacts, which are streamed."""
     login = {'Authorization': users['thor'].authorization()}
     path = '/api/2.0/mlflow/runs/log-batch'
     long = {'Content-Length': str(mlflow_access.BODY_BYTES + 1)}
@@ -163,7 +163,7 @@ def test_the_body_of_a_user_has_a_bound(users: dict[str, User], run: dict[str, A
 
 
 def _without_body(tower: Tower, method: str, path: str, headers: dict[str, str]) -> HTTPResponse:
-    """What is answered to a request that says that it has a body, before it sends any."""
+    """The response to a request that announces a body, before it sends any."""
     asked = HTTPConnection(tower.tracking_uri.removeprefix('http://'), timeout=60)
     try:
         asked.putrequest(method, path)
@@ -178,7 +178,7 @@ def _without_body(tower: Tower, method: str, path: str, headers: dict[str, str])
 
 
 def test_a_robot_logs_its_own_missions(users: dict[str, User], run: dict[str, Any]) -> None:
-    """All that the sender of missions asks for."""
+    """All requests of the missions' sender."""
     thor = users['thor']
     run_id = run['run_id']
     thor.call('POST', 'runs/log-batch', {'run_id': run_id, 'metrics': [{'key': 'a', 'value': 1, 'timestamp': 1, 'step': 0}]})
@@ -190,7 +190,7 @@ def test_a_robot_logs_its_own_missions(users: dict[str, User], run: dict[str, An
 
 
 def test_a_robot_creates_and_deletes_nothing(users: dict[str, User], run: dict[str, Any]) -> None:
-    """It makes and deletes no experiment, run, model, artifact, user or trace, by none of the paths; not even its own."""
+    """It can create and delete no experiment, run, model, artifact, user or trace, by any path; not even its own."""
     thor, experiment, run_id = users['thor'], run['experiment_id'], run['run_id']
     tried = [
         *(('POST', f'{api}/{path}', body) for api in API for path, body in (
@@ -224,7 +224,7 @@ def test_a_robot_creates_and_deletes_nothing(users: dict[str, User], run: dict[s
 
 
 def test_a_robot_has_no_access_to_anothers_experiment(users: dict[str, User], run: dict[str, Any]) -> None:
-    """It neither reads nor writes there, nor by a path that leads out of its own artifacts."""
+    """It can neither read nor write there, nor by a path that escapes its artifacts."""
     tachi, experiment, run_id = users['tachi'], run['experiment_id'], run['run_id']
     own = tachi.experiment('tachi_missions')
     metric = {'key': 'a', 'value': 9, 'timestamp': 1, 'step': 0}
@@ -264,7 +264,7 @@ def test_a_robot_has_no_access_to_anothers_experiment(users: dict[str, User], ru
 
 @pytest.mark.parametrize('name', ['tachi', 'spark'])
 def test_no_other_spelling_of_a_run_passes(users: dict[str, User], run: dict[str, Any], name: str) -> None:
-    """Who names a run of his own, and another one in the words that MLflow's check does not read, changes neither."""
+    """A request with a robot's run, and another one in a spelling that MLflow's check does not read, changes neither."""
     user, run_id = users[name], run['run_id']
     experiment = user.experiment('tachi_missions') if name == 'tachi' else str(
         user.call('POST', 'experiments/create', {'name': 'spelling'})['experiment_id'])  # fmt: skip
@@ -281,7 +281,7 @@ def test_no_other_spelling_of_a_run_passes(users: dict[str, User], run: dict[str
 
 
 def test_a_model_of_another_is_not_deleted_by_a_body_that_is_not_checked(users: dict[str, User]) -> None:
-    """MLflow's check reads the address of a DELETE whose body says that it is not JSON; its handler reads the body."""
+    """MLflow's check reads the URL of a DELETE with a body that is not declared as JSON; its handler reads the body."""
     spark, api = users['spark'], '/api/2.0/mlflow/registered-models'
     spark.send('POST', f'{api}/create', {'name': 'decoy'})
     users['tower'].send('POST', f'{api}/create', {'name': 'kept'})
@@ -300,7 +300,7 @@ PLACES = ['file:///etc', '/etc', 'file:/etc', 'FILE:///etc', 'sftp://localhost/e
 
 @pytest.mark.parametrize('user', ['spark', pytest.param('tower', marks=pytest.mark.long('as for spark'))])
 def test_no_user_chooses_the_artifact_location(users: dict[str, User], user: str) -> None:
-    """Neither by the field's name in the protocol nor by that in JSON, on none of the paths, and nothing is made."""
+    """Neither by the field's protobuf name nor by its JSON name, on any path, and nothing is created."""
     bodies = [{'name': f'{user}-{number}', field: place} for number, place in enumerate(PLACES)
               for field in ('artifact_location', 'artifactLocation')]  # fmt: skip
     bodies += [{**bodies[0], 'artifactLocation': ''}, {**bodies[0], 'artifactLocation': 'file:///etc', 'artifact_location': ''}]
@@ -313,7 +313,7 @@ def test_no_user_chooses_the_artifact_location(users: dict[str, User], user: str
 
 @pytest.mark.parametrize('place', [*PLACES, 'mlflow-artifacts:/0/x\nfile:///etc', 'file:///etc#runs:/1'])
 def test_no_model_comes_from_elsewhere(users: dict[str, User], run: dict[str, Any], place: str) -> None:
-    """A version of a model whose files would be read from another place is refused."""
+    """A model version with files from another location is refused."""
     spark = users['spark']
     spark.send('POST', '/api/2.0/mlflow/registered-models/create', {'name': 'policy'})
     prompt = {'tags': [{'key': 'mlflow.prompt.is_prompt', 'value': 'true'}]}
@@ -322,7 +322,7 @@ def test_no_model_comes_from_elsewhere(users: dict[str, User], run: dict[str, An
 
 
 def test_spark_reads_missions_and_writes_its_own_runs(users: dict[str, User], run: dict[str, Any]) -> None:
-    """It reads every robot's runs and changes none; experiments and models of its own it makes, and deletes."""
+    """It reads every robot's runs and changes none; it creates and deletes its own experiments and models."""
     spark = users['spark']
     read = spark.call('POST', 'runs/search', {'experiment_ids': [run['experiment_id']]})['runs']
     assert run['run_id'] in [one['info']['run_id'] for one in read]
@@ -352,7 +352,7 @@ def test_spark_reads_missions_and_writes_its_own_runs(users: dict[str, User], ru
 
 
 def test_a_second_password_is_valid_immediately(users: dict[str, User], tower: Tower, tmp_path: Path) -> None:
-    """And a retired one no more: the server reads its users anew, nothing is restarted, nothing stops while both are there."""
+    """And a retired one is invalid: the server reloads its users, without a restart and without an interruption."""
     old, new = 'the old one', 'the new one'
     file = next(tower._folder.glob('mlflow/users.json'))
     before = file.read_text()
@@ -372,7 +372,7 @@ def test_a_second_password_is_valid_immediately(users: dict[str, User], tower: T
 
 
 def test_the_files_contain_no_password(tower: Tower) -> None:
-    """Neither files, logs nor command lines; and what holds addresses is its owner's alone."""
+    """Neither files, logs nor command lines; and files with addresses are readable by their owner alone."""
     folder = tower._folder
     words = {tower.tracking(name)['MLFLOW_TRACKING_PASSWORD'].encode() for name in ('tower', 'spark', 'thor', 'tachi')}
     for path in (folder / 'mlflow').glob('*'):
@@ -389,14 +389,14 @@ def test_the_files_contain_no_password(tower: Tower) -> None:
 
 
 class Neighbor:
-    """A host of the network, for which another address of the loopback stands; the server's own address never waits."""
+    """A host of the network, imitated by another loopback address; the server's address is never blocked."""
 
     def __init__(self, tower: Tower, address: str) -> None:
         self._place = urllib3.util.parse_url(tower.tracking_uri)
         self.address = address
 
     def status(self, user: str, password: str) -> tuple[int, str | None]:
-        """Of a request with this login, and how long to wait."""
+        """The status of a request with this login, and how long to wait."""
         connection = HTTPConnection(str(self._place.host), self._place.port, timeout=60, source_address=(self.address, 0))
         login = base64.b64encode(f'{user}:{password}'.encode()).decode()
         try:
@@ -408,7 +408,7 @@ class Neighbor:
 
 
 def test_only_an_address_that_guesses_must_wait(tower: Tower) -> None:
-    """After some wrong passwords an address gets no answer to the right one either; other addresses do."""
+    """After some wrong passwords an address is refused even with the correct one; other addresses are not."""
     password = tower.tracking('spark')['MLFLOW_TRACKING_PASSWORD']
     guesser, other = Neighbor(tower, '127.0.9.1'), Neighbor(tower, '127.0.9.2')
     wrong = [guesser.status('spark', f'guess {number}')[0] for number in range(mlflow_access.MAX_WRONG + 2)]
@@ -419,7 +419,7 @@ def test_only_an_address_that_guesses_must_wait(tower: Tower) -> None:
 
 
 def test_the_memory_of_wrong_passwords_is_bounded() -> None:
-    """Any number of addresses may guess; those that guess now are remembered, and a wait ends."""
+    """Any number of addresses may guess; current ones are remembered, and a wait ends."""
     now = [0.0]
     wrong = mlflow_access.WrongPasswords(lambda: now[0])
     for number in range(3 * mlflow_access.MAX_ADDRESSES):
@@ -437,7 +437,7 @@ def test_the_memory_of_wrong_passwords_is_bounded() -> None:
 @pytest.mark.long('connections that are silent for half a minute')
 @pytest.mark.parametrize('said', [b'', b'GET / HT', b'GET /version HTTP/1.1\r\nHost: x\r\nX-Slow: ', b'two'])
 def test_a_silent_connection_is_closed(tower: Tower, said: bytes) -> None:
-    """Whoever sends no complete request is disconnected, also after a first one, and while a byte comes now and then."""
+    """A client without a complete request is disconnected, also after a first one, and while it sends occasional bytes."""
     place = urllib3.util.parse_url(tower.tracking_uri)
     with socket.create_connection((str(place.host), int(place.port or 0)), timeout=1.0) as one:
         if said == b'two':
@@ -460,7 +460,7 @@ def test_a_silent_connection_is_closed(tower: Tower, said: bytes) -> None:
 
 
 def _asgi_routes() -> list[tuple[str, str]]:
-    """Method and path of each route that MLflow serves beside Flask, whose paths Flask's check never sees."""
+    """Method and path of each route that MLflow serves outside Flask, which Flask's check does not cover."""
     program = """
 import json
 from mlflow.server import app, fastapi_app
@@ -479,7 +479,7 @@ for one in fastapi_app.create_fastapi_app(app).routes:
 
 @pytest.mark.long('imports all of MLflow')
 def test_routes_outside_flask_are_closed(users: dict[str, User]) -> None:
-    """Each that this version has is refused to strangers, robots and Spark, however a robot spells its path."""
+    """Each route of this version is refused to strangers, robots and Spark, however a robot spells its path."""
     routes = _asgi_routes()
     assert {'/v1/traces', '/gateway/proxy/{endpoint_name}/{path:path}'} < {path for _, path in routes}
     assert len(routes) > 60
@@ -502,7 +502,7 @@ def test_routes_outside_flask_are_closed(users: dict[str, User]) -> None:
 
 @pytest.mark.parametrize('name', ['', 'thor', 'spark'])
 def test_no_user_can_make_the_server_fetch_a_url(users: dict[str, User], name: str) -> None:
-    """No webhook, no gateway's secret or endpoint, no scorer: whatever would have the server ask another one is refused."""
+    """No webhook, no gateway secret or endpoint, no scorer: every feature that makes the server send a request is refused."""
     url = 'http://169.254.169.254/latest/meta-data/'
     asked = [
         ('POST', '/api/2.0/mlflow/webhooks', {'name': 'x', 'url': url, 'events': [{'entity': 'RUN', 'action': 'CREATED'}]}),
@@ -537,7 +537,7 @@ TAGS = {
 }  # fmt: skip
 SANDBOXES = 'all => all.map(one => one.getAttribute("sandbox"))'
 LOOK_MS = 1500
-"""For whatever a page shows to run, after it is shown."""
+"""Time for scripts on a page, after it is shown."""
 PAGE = b"""<html><body><script>
 try { window.top.pwned = 1 } catch (error) {}
 fetch('/ajax-api/2.0/mlflow/users/current').then(answer => { document.title = 'read ' + answer.status; alert('read') })
@@ -555,7 +555,7 @@ ARTIFACTS = {
 
 @pytest.fixture(scope='module')
 def browse(tower: Tower) -> Iterator[dict[str, Any]]:
-    """One of thor's, with whatever a robot can write."""
+    """A run of thor's, with everything that a robot can write."""
     thor = User(tower, 'thor')
     experiment = thor.experiment('thor_missions')
     made = thor.run(experiment)
@@ -572,7 +572,7 @@ def browse(tower: Tower) -> Iterator[dict[str, Any]]:
 
 @pytest.mark.parametrize('name', ARTIFACTS)
 def test_no_artifact_is_shown_as_a_page_of_the_server(tower: Tower, browse: dict[str, Any], name: str) -> None:
-    """Wherever a robot's artifact is handed out, browsers store it, and guess no type of it."""
+    """Browsers download a robot's artifact from any URL, and do not sniff its type."""
     spark = User(tower, 'spark')
     places = [_artifact(browse, name), _artifact(browse, name).replace('/api/', '/ajax-api/', 1)]
     for path in (*places, f'/get-artifact?path={name}&run_uuid={browse["run_id"]}'):
@@ -586,7 +586,7 @@ def test_no_artifact_is_shown_as_a_page_of_the_server(tower: Tower, browse: dict
 @pytest.mark.long('a browser that looks at a dozen pages')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_no_script_of_a_robot_runs_in_mlflows_pages(tower: Tower, browse: dict[str, Any]) -> None:
-    """Tags, notes, params and artifacts are shown: none opens a dialog, is a link that runs, or gets hold of the page."""
+    """Tags, notes, params and artifacts are shown: none opens a dialog, is an active link, or gets access to the page."""
     password = tower.tracking('spark')['MLFLOW_TRACKING_PASSWORD']
     place = f'/#/experiments/{browse["experiment_id"]}'
     pages = [place, f'{place}/runs', f'{place}/runs/{browse["run_id"]}',
@@ -622,5 +622,5 @@ def test_no_script_of_a_robot_runs_in_mlflows_pages(tower: Tower, browse: dict[s
     assert len(found) == len(pages)
     assert {path: each for path, each in found.items() if each['dialogs'] or each['pwned'] or each['links']} == {}
     frames = [sandbox for each in found.values() for sandbox in each['frames']]
-    assert 'allow-scripts' in frames  # the HTML page, in an origin of its own
+    assert 'allow-scripts' in frames  # the HTML page, in a separate origin
     assert set(frames) <= {'allow-scripts'}

@@ -1,4 +1,4 @@
-"""The rights of a Tower's users on a real SeaweedFS, also for objects sent in parts."""
+"""The permissions of a Tower's users on a real SeaweedFS, also for objects sent in parts."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _object(folder: Path, key: str, body: bytes) -> SpooledObject:
 
 
 def test_the_logger_works_with_a_robots_keys(server: Tower, tmp_path: Path) -> None:
-    """All that delivery asks of the store is allowed, and the condition is honoured on a bucket that keeps versions."""
+    """Everything that delivery requests is allowed, and the condition is honored on a versioned bucket."""
     store = S3Store(server.store_settings('thor'), UploadSettings())
     store.open()
     try:
@@ -87,7 +87,7 @@ def test_the_logger_works_with_a_robots_keys(server: Tower, tmp_path: Path) -> N
 
 
 def test_a_robot_cannot_delete(as_user: Connect) -> None:
-    """Neither one object, nor many at once, nor a version; and it cannot lift the rule."""
+    """Neither one object, nor many at once, nor a version; and it cannot change the policy."""
     thor = as_user('thor')
     thor.put_object(Bucket='sensor-data', Key='thor/keep', Body=b'one')
     version = as_user('tower').list_object_versions(Bucket='sensor-data', Prefix='thor/keep')['Versions'][0]['VersionId']
@@ -117,7 +117,7 @@ def test_objects_that_a_robot_replaces_are_kept(as_user: Connect) -> None:
 
 
 def test_a_robot_has_access_to_its_own_objects_only(as_user: Connect) -> None:
-    """It can neither read, write, copy nor list what belongs to others, nor make a bucket."""
+    """It can neither read, write, copy nor list other objects, nor create a bucket."""
     as_user('tachi').put_object(Bucket='sensor-data', Key='tachi/secret', Body=b'one')
     thor = as_user('thor')
     assert _is_denied(thor.get_object, Bucket='sensor-data', Key='tachi/secret')
@@ -145,7 +145,7 @@ def test_spark_reads_everything_and_changes_nothing_of_a_robot(as_user: Connect)
 
 
 def test_only_spark_writes_training_sets(as_user: Connect) -> None:
-    """It puts datasets into their bucket, replaces and deletes them; a robot does none of this."""
+    """It puts datasets into their bucket, replaces and deletes them; a robot can do none of this."""
     spark, thor, key = as_user('spark'), as_user('thor'), 'datasets/go2/set/meta/info.json'
     spark.put_object(Bucket='lerobot', Key=key, Body=b'one')
     for call in (thor.put_object, thor.get_object, thor.delete_object):
@@ -156,7 +156,7 @@ def test_only_spark_writes_training_sets(as_user: Connect) -> None:
 
 
 def test_robots_read_only_policies_there(as_user: Connect) -> None:
-    """A robot gets each object below policies, and neither lists, writes nor deletes there, nor sees what is beside it."""
+    """A robot gets each object below policies, and can neither list, write nor delete there, nor see other folders."""
     spark, thor, key = as_user('spark'), as_user('thor'), 'policies/go2/go2_patrol_v7/manifest.json'
     for name in (key, 'policies_of_others/x', 'datasets/x'):
         spark.put_object(Bucket='lerobot', Key=name, Body=b'one')
@@ -173,7 +173,7 @@ def test_robots_read_only_policies_there(as_user: Connect) -> None:
 
 
 def test_old_data_is_deleted_by_one_user_alone(server: Tower, as_user: Connect, tmp_path: Path) -> None:
-    """`lake prune` with the keys of a robot, and with those of Spark, deletes nothing and writes no row; with its own it does."""
+    """`lake prune` with the keys of a robot, or of Spark, deletes nothing and writes no row; with its own user's it does."""
     at_ns = 1_790_000_000 * SECOND
     rows = [row('camera', at_ns + number * SECOND) for number in range(3)]
     with closing(S3Store(server.store_settings('thor'), UploadSettings())) as robot:
@@ -204,7 +204,7 @@ def test_old_data_is_deleted_by_one_user_alone(server: Tower, as_user: Connect, 
 
 
 def test_the_server_can_delete_by_age(as_user: Connect) -> None:
-    """As lifecycle rules of each robot's folder of a sensor; what is no such rule is refused."""
+    """With lifecycle rules for each robot's folder of a sensor; other rules are refused."""
     tower = as_user('tower')
     before = tower.get_bucket_lifecycle_configuration(Bucket='sensor-data')['Rules']
     assert prepare.prepare(tower, ['thor', 'tachi'], [prepare.expiry_of('camera=90')]) == []
@@ -219,7 +219,7 @@ def test_the_server_can_delete_by_age(as_user: Connect) -> None:
 
 
 def test_mlflow_has_its_bucket_alone(as_user: Connect) -> None:
-    """It reads, writes and deletes artifacts, and nothing else."""
+    """It can read, write and delete artifacts, and nothing else."""
     mlflow = as_user('mlflow')
     mlflow.put_object(Bucket='mlflow', Key='1/a', Body=b'one')
     mlflow.delete_object(Bucket='mlflow', Key='1/a')
@@ -229,7 +229,7 @@ def test_mlflow_has_its_bucket_alone(as_user: Connect) -> None:
 def test_preparing_again_changes_nothing(
     server: Tower, as_user: Connect, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A second run leaves the data, and the robots are those of the file that make_secrets.py writes."""
+    """A second run keeps the data, and the robots are those of the file that make_secrets.py writes."""
     as_user('thor').put_object(Bucket='sensor-data', Key='thor/stays', Body=b'one')
     for name, value in server.environment().items():
         monkeypatch.setenv(name, value)
@@ -274,7 +274,7 @@ def test_a_mailbox_is_read_by_its_robot_and_written_by_spark(server: Tower, as_u
 
 
 def test_the_doctor_races_for_a_mailbox(server: Tower) -> None:
-    """With the keys of those who may ask, one wins each time; a robot's may not ask at all."""
+    """With the keys of users with permission, one wins each time; a robot may not write at all."""
     for user, severity in (('spark', Severity.OK), ('thor', Severity.INFO)):
         with single_requests(server.store_settings(user)) as requests:
             (found,) = race_mailboxes(requests)
@@ -282,13 +282,13 @@ def test_the_doctor_races_for_a_mailbox(server: Tower) -> None:
 
 
 class _Ignoring:
-    """A server that takes every put, whatever its condition says."""
+    """A server that accepts every put, whatever its condition."""
 
     def __init__(self, *, makes: bool) -> None:
         self._makes = makes
 
     def put(self, *_: Any, **__: Any) -> None:
-        """It is there then."""
+        """The object exists afterwards."""
 
     def changed(self, *_: Any) -> tuple[bytes, str]:
         return b'', 'version'
@@ -302,7 +302,7 @@ class _Ignoring:
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize(('makes', 'says'), [(False, 'does not apply If-Match'), (True, 'MinIO')])
 def test_the_doctor_detects_a_server_that_ignores_if_match(makes: bool, says: str) -> None:
-    """Or that makes what is not there."""
+    """Or one that creates a missing object."""
     (found,) = race_mailboxes(_Ignoring(makes=makes))  # type: ignore[arg-type]
     assert found.is_finding
     assert says in found.cause
@@ -334,7 +334,7 @@ YEAR_S = 52 * 7 * 86_400
 def test_presigned_urls_expire_with_a_robots_keys(
     server: Tower, as_user: Connect, user: str, version: str, seconds: int, method: str, status: int
 ) -> None:
-    """A robot signs no URL, and Spark none for longer than a week; nothing restricts the Tower's own user."""
+    """A robot signs no URL, and Spark none for longer than a week; the Tower's own user is not restricted."""
     as_user('thor').put_object(Bucket='sensor-data', Key='thor/camera/url.txt', Body=b'mine')
     url = _presigned(server, user, version, seconds, method)
     body = b'theirs' if method == 'put_object' else None
@@ -345,7 +345,7 @@ def test_presigned_urls_expire_with_a_robots_keys(
 
 @pytest.mark.parametrize('how', ['put', 'copy', 'parts'])
 def test_a_robot_cannot_encrypt_with_its_own_key(as_user: Connect, how: str) -> None:
-    """With SSE-C nothing is stored, and what the server encrypts with its own key is read by Spark."""
+    """With SSE-C nothing is stored, and objects encrypted with the server's key are readable by Spark."""
     thor, where = as_user('thor'), {'Bucket': 'sensor-data', 'Key': f'thor/camera/hidden-{how}.txt'}
     thor.put_object(Bucket='sensor-data', Key='thor/camera/plain.txt', Body=b'plain', ServerSideEncryption='AES256')
     own = {'SSECustomerAlgorithm': 'AES256', 'SSECustomerKey': b'k' * 32}
@@ -361,7 +361,7 @@ def test_a_robot_cannot_encrypt_with_its_own_key(as_user: Connect, how: str) -> 
 
 
 def test_verify_finds_a_hidden_object(server: Tower, as_user: Connect, tmp_path: Path) -> None:
-    """An object encrypted with the client's own key (SSE-C) is a finding and does not stop the audit; HEAD answers only 400."""
+    """An object encrypted with the client's key (SSE-C) is a finding and does not stop the audit; HEAD only responds with 400."""
     bodies = {'thor/camera/sse-a.txt': b'one', 'thor/camera/sse-b.txt': b'hidden', 'thor/camera/sse-c.txt': b'three'}
     admin = as_user('tower')
     own = {'SSECustomerAlgorithm': 'AES256', 'SSECustomerKey': b'k' * 32}
@@ -383,7 +383,7 @@ def test_verify_finds_a_hidden_object(server: Tower, as_user: Connect, tmp_path:
 
 def test_a_robot_that_is_over_its_quota_stores_nothing_more(server: Tower, as_user: Connect, monkeypatch: pytest.MonkeyPatch,
                                                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
-    """All versions and unfinished uploads count; other robots go on, and so does this one once it may store more."""
+    """All versions and unfinished uploads count; other robots continue, and so does this one once it has quota again."""
     for name, value in server.environment().items():
         monkeypatch.setenv(name, value)
     robots = ['--robot', 'thor', '--robot', 'tachi']
@@ -414,7 +414,7 @@ def test_a_robot_that_is_over_its_quota_stores_nothing_more(server: Tower, as_us
 
 @pytest.mark.parametrize('text', ['', 'thor', 'thor=', '=5', 'thor=-1', 'thor=1e3', '../x=5', 'thor=nan'])
 def test_an_invalid_quota_is_rejected(text: str) -> None:
-    """With what it should look like."""
+    """With the expected format."""
     with pytest.raises(ArgumentTypeError, match='such as thor=500'):
         prepare.quota_of(text)
     assert prepare.quota_of('thor=0.5') == ('thor', 0.5)
@@ -425,7 +425,7 @@ CONTENT = random.Random(1).randbytes(4 * PART + 12_345)
 KEY = 'thor/rosbags/patrol_20261121_120000/patrol_20261121_120000_0.mcap'
 PARTS = [1, 2, 3, 4, 5]
 BEFORE = 2
-"""Parts that are there when the robot loses its power."""
+"""The parts sent before the robot loses power."""
 PROGRAM = """
 import sys
 from pathlib import Path
@@ -442,7 +442,7 @@ store.put(slice_of(Path(sys.argv[2])))
 
 
 class Watching(Front):
-    """Knows which parts were sent and what else was asked for, and answers nothing more after so many parts."""
+    """Records the parts sent and other requests, and stops responding after this many parts."""
 
     def __init__(self, url: str, most: int) -> None:
         super().__init__(url, lambda: Fault.HUNG if len(self.sent) >= most else Fault.NONE)
@@ -458,7 +458,7 @@ class Watching(Front):
 
 
 def slice_of(path: Path, key: str = KEY) -> SpooledObject:
-    """What the file holds, as an object of the spool."""
+    """The content of the file, as an object of the spool."""
     body = path.read_bytes()
     sha256 = hashlib.sha256(body).hexdigest()
     return SpooledObject(1, 'sensor-data', key, path, len(body), sha256, 'application/x-mcap', {'sensor': 'rosbags'}, 5, 0)
@@ -473,14 +473,14 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is large here is a fraction of a slice."""
+    """Make a fraction of a slice count as large."""
     monkeypatch.setattr(s3_puts, 'MULTIPART_BYTES', PART)
     monkeypatch.setattr(content, 'PART_BYTES', PART)
 
 
 @pytest.fixture
 def through(server: Tower) -> Iterator[Callable[[Front], S3Store]]:
-    """A store with the keys of thor, by way of a front."""
+    """A store with the keys of thor, through a proxy."""
     opened: list[S3Store] = []
 
     def make(front: Front) -> S3Store:
@@ -503,7 +503,7 @@ def under_way(client: Any, prefix: str = '') -> list[str]:
 def test_a_slice_interrupted_by_a_kill_is_resumed(
     server: Tower, as_user: Callable[[str], Any], through: Callable[[Front], S3Store], file: Path
 ) -> None:
-    """The parts that are there are not sent again, nothing is denied on the way, and no upload stays behind."""
+    """Existing parts are not sent again, nothing is denied, and no upload is left behind."""
     given = server.environment('thor')
     with Watching(server.endpoint_url, BEFORE) as front:
         keys = (given['AWS_ACCESS_KEY_ID'], given['AWS_SECRET_ACCESS_KEY'])
@@ -534,7 +534,7 @@ def test_a_slice_interrupted_by_a_kill_is_resumed(
 def test_an_upload_of_other_content_is_aborted(
     as_user: Callable[[str], Any], server: Tower, through: Callable[[Front], S3Store], file: Path
 ) -> None:
-    """The policy against deleting does not keep a robot from ending its own uploads."""
+    """The policy against deleting does not prevent a robot from aborting its own uploads."""
     key = f'{KEY}.other'
     thor = as_user('thor')
     upload = thor.create_multipart_upload(Bucket='sensor-data', Key=key)['UploadId']
@@ -547,7 +547,7 @@ def test_an_upload_of_other_content_is_aborted(
 
 @pytest.mark.usefixtures('small_parts')
 def test_uploads_of_others_are_ignored(as_user: Callable[[str], Any]) -> None:
-    """It can neither take part in them nor see their parts nor end them."""
+    """It can neither add to them nor see their parts nor abort them."""
     tachi, thor, key = as_user('tachi'), as_user('thor'), 'tachi/rosbags/a.mcap'
     upload = tachi.create_multipart_upload(Bucket='sensor-data', Key=key)['UploadId']
     what = {'Bucket': 'sensor-data', 'Key': key, 'UploadId': upload}

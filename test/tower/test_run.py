@@ -1,4 +1,4 @@
-"""A Tower of plain processes: all of it answers, a key is changed while it runs, and nothing is left behind."""
+"""A Tower of plain processes: everything responds, a key is changed at run time, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ pytestmark = [
 ]
 START_S: Final = 120.0
 HOST: Final = '127.0.0.2'
-"""What stands for the address that others reach the machine at."""
+"""Stands for the address at which other machines reach this one."""
 
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory: pytest.TempPathFactory, offset: int) -> Iterator[Path]:
-    """Of a Tower that runs."""
+    """The folder of a running Tower."""
     folder = tmp_path_factory.mktemp('plain')
     command = [sys.executable, str(TOWER / 'run.py'), '--folder', str(folder), '--offset', str(offset), '--bind', HOST]
     with (folder / 'log').open('w', encoding='utf-8') as log, subprocess.Popen(command, stdout=log, stderr=log) as tower:
@@ -71,14 +71,14 @@ def _works(folder: Path, offset: int, key: dict[str, str]) -> bool:
 
 
 def test_nothing_without_a_key_is_reachable(folder: Path, offset: int) -> None:
-    """Neither the filer, which gives and deletes whatever is stored, nor the volume server, the master and the database."""
+    """Neither the filer, which reads and deletes any object, nor the volume server, the master and the database."""
     for port in (9333, 8080, 8888, 19333, 18080, 18888, 5432):
         with socket.socket() as one:
             assert one.connect_ex((HOST, port + offset)) == errno.ECONNREFUSED, port
 
 
 def test_artifacts_go_through_mlflow_to_the_store(folder: Path, offset: int) -> None:
-    """What is put to MLflow's artifact service lies in the bucket mlflow; the sender needs a password, and no key of S3."""
+    """Artifacts put to MLflow's service are in the bucket mlflow; the sender needs a password, and no S3 key."""
     environ = make_secrets.read_env(folder / 'secrets' / 'thor.env')
     login = f'{environ["MLFLOW_TRACKING_USERNAME"]}:{environ["MLFLOW_TRACKING_PASSWORD"]}'
     url = f'http://{HOST}:{5001 + offset}/api/2.0/mlflow-artifacts/artifacts/1/hello.txt'
@@ -101,7 +101,7 @@ def _mlflow_processes(offset: int) -> list[Path]:
 
 
 def test_mlflow_runs_unprivileged(folder: Path, offset: int) -> None:
-    """Its processes are not root's, whoever runs the Tower, and not those of a user whom another service runs as."""
+    """Its processes do not run as root, whichever user runs the Tower, and not as a user of another service."""
     servers = _mlflow_processes(offset)
     assert servers
     owners = {pwd.getpwuid(server.stat().st_uid).pw_name for server in servers}
@@ -124,7 +124,7 @@ def test_no_environment_and_no_command_line_has_the_key_of_the_store(folder: Pat
 
 
 def test_no_server_leaves_its_memory_on_the_disk(folder: Path) -> None:
-    """However a server ends, no core dump has its keys and passwords."""
+    """However a server exits, there is no core dump with its keys and passwords."""
     numbers = list(processes_of(folder))
     limits = [line for number in numbers for line in Path(f'/proc/{number}/limits').read_text().splitlines()
               if line.startswith('Max core file size')]  # fmt: skip
@@ -135,7 +135,7 @@ def test_no_server_leaves_its_memory_on_the_disk(folder: Path) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason='another user is needed')
 @pytest.mark.parametrize('user', ['nobody', 'postgres'])
 def test_another_service_of_the_machine_reads_nothing_of_mlflow(folder: Path, offset: int, user: str) -> None:
-    """Neither its environment nor its files, as a user that services share; nor, as nobody, the database."""
+    """Neither its environment nor its files, as a user shared by services; nor, as the user nobody, the database."""
     mlflow, sockets = (run_module.unprivileged_folders(folder, offset)[name] for name in ('mlflow', 'sockets'))
     wanted = [str(server / 'environ') for server in _mlflow_processes(offset)]
     wanted += [str(mlflow / name) for name in ('s3.keys', 'auth.ini')]
@@ -155,7 +155,7 @@ def test_another_service_of_the_machine_reads_nothing_of_mlflow(folder: Path, of
 
 
 def test_a_password_of_mlflow_is_changed_while_it_runs(folder: Path, offset: int) -> None:
-    """The new one works beside the old one, and the retired one no more; nothing is told to do so."""
+    """The new one is valid next to the old one, and the retired one no more; no signal is needed."""
 
     def works(password: str) -> bool:
         request = urllib.request.Request(f'http://{HOST}:{5001 + offset}/version')
@@ -187,7 +187,7 @@ def _words(cmdline: Path) -> list[bytes]:
 
 
 def test_a_key_is_changed_while_it_runs(folder: Path, offset: int) -> None:
-    """After SIGHUP the new key works beside the old one, and once that is retired it does not work any more."""
+    """After SIGHUP the new key is valid next to the old one, and once that is retired it is invalid."""
     users = folder / 'secrets' / 'users.json'
     old = make_secrets.load_users(users)['thor'][0]
     assert _works(folder, offset, old)
@@ -204,7 +204,7 @@ def test_a_key_is_changed_while_it_runs(folder: Path, offset: int) -> None:
 
 
 def test_a_seaweedfs_without_keys_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that does not ask for the certificate is found out and ended, before robots send to it."""
+    """One that does not require the certificate is detected and stopped, before robots send to it."""
     make_secrets.make(tmp_path, '127.0.0.1', ['thor'])
     monkeypatch.setattr(run.Runner, '_seaweed_environ', run.Runner._environ)
     tower = run.Runner(tmp_path, '127.0.0.1', free_offset())
@@ -215,7 +215,7 @@ def test_a_seaweedfs_without_keys_is_refused(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.parametrize(('port', 'name'), [(9000, 'S3'), (5001, 'MLflow'), (9333, 'master')])
 def test_a_port_in_use_is_named(tmp_path: Path, port: int, name: str) -> None:
-    """A server that is left over is not taken for the one that is started: nothing is started beside it."""
+    """A leftover server is not mistaken for the one being started: nothing is started next to it."""
     make_secrets.make(tmp_path, HOST, ['thor'])
     offset = free_offset()
     with socket.create_server((HOST, port + offset)), pytest.raises(ServerFailed, match=f'{port + offset}, the port of .*{name}'):

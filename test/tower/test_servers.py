@@ -1,6 +1,6 @@
-"""Somebody without keys, on the network or as a user of the machine, gets nowhere at any port that SeaweedFS listens on.
+"""A client without keys, on the network or as a user of the machine, has no access at any port of SeaweedFS.
 
-Each attack is made on a SeaweedFS without keys as well, where it has to succeed: else its failure would say nothing.
+Each attack is also made on a SeaweedFS without keys, where it must succeed: otherwise its failure would prove nothing.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from tower_scripts import TOWER, make_secrets, prepare, processes_of, remove_dat
 pytestmark = pytest.mark.seaweedfs
 START_S: Final = 150.0
 REFUSED: Final = 'UNAVAILABLE'
-"""What gRPC's client says where it gets no connection at all."""
+"""The message of gRPC's client without any connection."""
 HTTP2: Final = b'PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n' + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
-"""A client's greeting, with settings of which there are none (RFC 9113, 3.4)."""
+"""A client's HTTP/2 preface, with empty settings (RFC 9113, 3.4)."""
 
 
 @dataclass(frozen=True)
 class Running:
-    """A Tower with its S3 server, as somebody else meets it."""
+    """A Tower with its S3 server, from a stranger's view."""
 
     host: str
     ports: dict[str, int]
-    """Of HTTP, by SeaweedFS's server; those of gRPC are ``GRPC`` above."""
+    """Ports of HTTP, by SeaweedFS's server; those of gRPC are ``GRPC`` above."""
     secrets: Path
     """The folder with ``seaweedfs.crt`` and ``seaweedfs.key``."""
     owner: dict[str, str]
@@ -73,7 +73,7 @@ def _until(ready: Callable[[], object], seconds: float, said: Callable[[], str])
 
 @pytest.fixture(scope='module')
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """SeaweedFS without keys, with a bucket of its own for each test that empties one."""
+    """SeaweedFS without keys, with a separate bucket for each test that empties one."""
     folder = tmp_path_factory.mktemp('open') / 'tower'
     with open_seaweed(folder) as ports:
         running = Running(HOST, dict(ports), folder, KEY, KEY)
@@ -107,7 +107,7 @@ def _command(number: int) -> str:
 
 
 def _older(folder: Path) -> dict[str, list[dict[str, str]]]:
-    """The folder of a Tower from before SeaweedFS's servers were given keys; its users."""
+    """The folder of a Tower from before SeaweedFS's servers had keys; its users."""
     make_secrets.make(folder, HOST, ['thor'])
     for path in (folder / 'secrets').glob('seaweedfs.*'):
         path.unlink()
@@ -116,7 +116,7 @@ def _older(folder: Path) -> dict[str, list[dict[str, str]]]:
 
 @contextmanager
 def composed(folder: Path) -> Iterator[Running]:
-    """The S3 server of compose.yaml, with the environment and the working directory that it names there."""
+    """The S3 server of compose.yaml, with its environment and working directory there."""
     folder.mkdir()
     _older(folder)
     make_secrets.make(folder, None, [])
@@ -148,7 +148,7 @@ def composed(folder: Path) -> Iterator[Running]:
 
 @contextmanager
 def neighbor() -> Iterator[tuple[str, str]]:
-    """Another network namespace, and our address on the cable to it; skips where none can be made."""
+    """Another network namespace, and our address on the link to it; skips if none can be created."""
     name = f'stranger{os.getpid()}'
     net = f'10.{random.randrange(200, 250)}.{random.randrange(250)}'
     inside, outside = f'{name[-9:]}i', f'{name[-9:]}o'
@@ -199,7 +199,7 @@ LONG: Final = pytest.mark.long('Towers of its own')
     ids=lambda start: start.__name__,
 )  # fmt: skip
 def closed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A Tower as we start it, in each of the ways that we do."""
+    """A Tower as we start it, in each way."""
     with request.param(tmp_path_factory.mktemp('closed') / 'tower') as running:
         yield running
 
@@ -244,7 +244,7 @@ def _attack(target: Running, view: tuple[str, str], *names: str) -> dict[str, tu
 
 
 def _becomes_administrator(target: Running) -> bool:
-    """Whether a key that somebody chose is one of an administrator once they told the S3 server so."""
+    """Whether a self-chosen key is an administrator's once a client has sent it to the S3 server."""
     for view in target.views:
         _attack(target, view, 'make an administrator')
     try:
@@ -256,7 +256,7 @@ def _becomes_administrator(target: Running) -> bool:
 
 @pytest.mark.long('a Tower of its own')
 def test_attacks_succeed_where_there_are_no_keys(opened: Running) -> None:
-    """SeaweedFS as it starts by itself answers each of them, and with it whoever asks is its administrator."""
+    """With its defaults SeaweedFS accepts each of them, and makes the client an administrator."""
     told = _attack(opened, (HOST, ''), *ATTACKS)
     assert {name: status for name, (status, _) in told.items() if status != 'OK'} == {}
     assert opened.owner['secretKey'].encode() in told['read all keys'][1]
@@ -264,14 +264,14 @@ def test_attacks_succeed_where_there_are_no_keys(opened: Running) -> None:
 
 
 def test_attacks_fail_where_there_are_keys(closed: Running) -> None:
-    """None is answered, and the administrator that one would have made has no access."""
+    """None is accepted, and the administrator that it would have created has no access."""
     for view in closed.views:
         assert {name: answer for name, answer in _attack(closed, view, *ATTACKS).items() if answer != (REFUSED, b'')} == {}
     assert not _becomes_administrator(closed)
 
 
 def _lifecycle_deletes(target: Running) -> str:
-    """The status, for an object of its own, which has no rule that it would be deleted by."""
+    """The status, for a separate object, which no rule deletes."""
     target.client(target.robot).put_object(Bucket='sensor-data', Key='thor/kept', Body=b'one')
     _, method, _ = ATTACKS['delete as the lifecycle does']
     body = field(1, b'sensor-data') + field(2, b'thor/kept') + field(5, 1)
@@ -281,7 +281,7 @@ def _lifecycle_deletes(target: Running) -> str:
 
 
 def test_the_lifecycle_api_requires_keys(opened: Running, closed: Running) -> None:
-    """It takes an object away where there are no keys; with them the object is there afterwards."""
+    """It deletes an object without keys; with them the object is there afterwards."""
     assert _lifecycle_deletes(opened) == 'OK'
     with pytest.raises(ClientError):
         opened.client(opened.robot).get_object(Bucket='sensor-data', Key='thor/kept')
@@ -291,7 +291,7 @@ def test_the_lifecycle_api_requires_keys(opened: Running, closed: Running) -> No
 
 @LONG
 def test_no_grpc_method_answers_without_a_key(opened: Running, closed: Running) -> None:
-    """All that this version of SeaweedFS offers by gRPC, as the one without keys tells it."""
+    """For all gRPC methods of this version of SeaweedFS, as listed by the one without keys."""
     servers = [server for server in closed.ports if server != 'admin']
     offered = {server: methods(HOST, opened.ports[server] + GRPC) for server in servers}
     assert {method for _, method, _ in ATTACKS.values()} <= {method for each in offered.values() for method in each}
@@ -305,11 +305,11 @@ def test_no_grpc_method_answers_without_a_key(opened: Running, closed: Running) 
 
 
 WORKERS: Final = ['/worker_pb.WorkerService/WorkerStream', '/plugin.PluginControlService/WorkerStream']
-"""Of the one server that does not tell what it offers."""
+"""The methods of the only server without reflection."""
 
 
 def _greeted(target: Running, server: str, certificate: Path | None) -> bytes:
-    """What a client that encrypts gets to hear; with ``certificate``, the folder of one and of its key, it shows that."""
+    """The response to a client with TLS; with ``certificate``, a folder with one and its key, it presents that."""
     trust = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     trust.check_hostname, trust.verify_mode = False, ssl.CERT_NONE
     trust.set_alpn_protocols(['h2'])
@@ -324,7 +324,7 @@ def _greeted(target: Running, server: str, certificate: Path | None) -> bytes:
 
 
 def test_only_its_own_certificate_opens_a_port(closed: Running, tmp_path: Path) -> None:
-    """Encryption alone is not enough, nor is a certificate that somebody made the same way."""
+    """TLS alone is not enough, nor is a certificate created in the same way."""
     make_secrets.make_certificate(tmp_path)
     for server in closed.ports:
         assert _greeted(closed, server, None) == b'', server
@@ -350,7 +350,7 @@ WEB: Final = {
 
 
 def test_the_web_interface_reveals_nothing(opened: Running, closed: Running) -> None:
-    """What serves everybody by HTTP where there are no keys refuses here; a volume server refuses every object by its number."""
+    """Pages that are public without keys are refused here; a volume server refuses every object by its id."""
     for name, (server, method, path) in WEB.items():
         assert _status(opened, server, method, path) < 400, name
         assert _status(closed, server, method, path) >= 400, name
@@ -359,7 +359,7 @@ def test_the_web_interface_reveals_nothing(opened: Running, closed: Running) -> 
 
 
 def test_valid_keys_keep_working(closed: Running) -> None:
-    """The robot puts and gets its own, also in parts, and nothing else."""
+    """The robot can put and get its own objects, also in parts, and nothing else."""
     thor = closed.client(closed.robot)
     body = os.urandom(6 << 20)
     thor.put_object(Bucket='sensor-data', Key='thor/large', Body=body)
@@ -380,7 +380,7 @@ def test_valid_keys_keep_working(closed: Running) -> None:
 
 @pytest.mark.parametrize('closed', [pytest.param(made, marks=LONG, id='made')], indirect=True)
 def test_a_neighbor_reaches_s3_and_mlflow_alone(closed: Running) -> None:
-    """Of all ports that a Tower listens on, those two take a connection from another namespace, and S3's gRPC, which refuses."""
+    """Of all ports of a Tower, those two accept a connection from another namespace, and S3's gRPC, which refuses calls."""
     listening = _listening(closed.secrets.parent)
     assert {port + extra for port in closed.ports.values() for extra in (0, GRPC)} <= listening
     s3 = closed.ports['s3']
@@ -389,7 +389,7 @@ def test_a_neighbor_reaches_s3_and_mlflow_alone(closed: Running) -> None:
 
 @pytest.mark.long('a Tower of its own')
 def test_a_tower_checks_only_its_own_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After its start, at the address of others and at its own: another Tower beside it is none of its business."""
+    """After its start, at the public address and at its own: another Tower next to it is not checked."""
     asked: set[tuple[str, int]] = set()
     monkeypatch.setattr(run.seaweedfs, 'answers_without_keys', lambda host, port, _: asked.add((host, port)))
     run.Runner(tmp_path, '127.0.0.2', 100)._check_authentication()
@@ -398,12 +398,12 @@ def test_a_tower_checks_only_its_own_ports(tmp_path: Path, monkeypatch: pytest.M
 
 
 def _listening(folder: Path) -> set[int]:
-    """The TCP ports that the processes of a Tower listen on, and their children."""
+    """The TCP ports of a Tower's processes and their children."""
     parents = {}
     for entry in Path('/proc').glob('[0-9]*/stat'):
         try:
             parents[int(entry.parent.name)] = int(entry.read_text().rpartition(')')[2].split()[1])
-        except OSError:  # it has ended meanwhile
+        except OSError:  # it has exited in the meantime
             continue
     ours = set(processes_of(folder))
     while more := {number for number, parent in parents.items() if parent in ours} - ours:

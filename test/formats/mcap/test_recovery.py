@@ -37,7 +37,7 @@ HOSTILE = settings(max_examples=examples(60), deadline=None, suppress_health_che
 
 @pytest.fixture(autouse=True)
 def _without_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hundreds of files that need not survive the machine."""
+    """Skip syncs for hundreds of files that need not survive the machine."""
     for name in ('fsync', 'fdatasync'):
         monkeypatch.setattr(os, name, lambda _: None)
 
@@ -56,7 +56,7 @@ WRITTEN = [one for _, one in messages(COUNT)]
 
 
 def recovered(folder: Path, content: bytes) -> SliceInfo:
-    """Of an open slice with this content; checked by readers."""
+    """A recovered slice with this content; checked by readers."""
     (folder / 'bag_0.mcap').unlink(missing_ok=True)
     (folder / 'bag_0.mcap.open').write_bytes(content)
     info = recover(folder / 'bag_0.mcap.open')
@@ -70,7 +70,7 @@ def recovered(folder: Path, content: bytes) -> SliceInfo:
 
 
 def test_a_killed_writer_loses_its_open_chunk(tmp_path: Path, opened: bytes) -> None:
-    """All that was synced is there, and nothing is called damaged."""
+    """Everything synced is there, and nothing is reported as damaged."""
     info = recovered(tmp_path, opened)
     assert in_order(info.path) == WRITTEN
     assert info.damage == Damage(0, 0, 0)
@@ -91,7 +91,7 @@ def test_a_recovered_slice_is_a_closed_one(tmp_path: Path, opened: bytes) -> Non
 @HOSTILE
 @given(st.data())
 def test_a_file_cut_off_anywhere_keeps_its_complete_chunks(tmp_path: Path, opened: bytes, data: st.DataObject) -> None:
-    """What is left is whole chunks from the beginning; at most one chunk is torn, and its bytes are named."""
+    """The complete chunks from the beginning are kept; at most one chunk is torn, and its bytes are reported."""
     length = data.draw(st.integers(0, len(opened)))
     info = recovered(tmp_path, opened[:length])
     found = in_order(info.path)
@@ -121,7 +121,7 @@ def test_a_flipped_byte_costs_its_chunk(tmp_path: Path, opened: bytes, data: st.
 
 @pytest.mark.parametrize('op', [*range(0x12), 0x7F])
 def test_a_chunk_with_another_opcode_is_skipped(tmp_path: Path, opened: bytes, op: int) -> None:
-    """It is found by its fields and its checksum, whatever the first byte of its record was turned into."""
+    """It is found by its fields and its checksum, whatever the first byte of its record is now."""
     at = [place for place in range(len(opened)) if opened[place : place + 9] == opened[opened.index(b'\x06') :][:9]][2]
     content = bytearray(opened)
     content[at] = op
@@ -140,7 +140,7 @@ def test_a_broken_chunk_in_the_middle_costs_only_itself(tmp_path: Path, opened: 
 
 
 def test_a_broken_index_is_rebuilt(tmp_path: Path, opened: bytes) -> None:
-    """Index entries that point elsewhere are not trusted: they are what the chunk says."""
+    """Index entries that point elsewhere are ignored: they are rebuilt from the chunk."""
     entry = WRITTEN[A_CHUNK].log_ns.to_bytes(8, 'little')
     at = opened.rindex(entry)
     content = opened[:at] + bytes(8) + opened[at + 8 :]
@@ -149,7 +149,7 @@ def test_a_broken_index_is_rebuilt(tmp_path: Path, opened: bytes) -> None:
 
 @pytest.mark.parametrize('tail', [bytes(5000), b'\xff' * 300, random.Random(3).randbytes(70_000)], ids=['zeros', 'ones', 'noise'])
 def test_any_bytes_at_the_end_are_cut_off(tmp_path: Path, opened: bytes, tail: bytes) -> None:
-    """What a file system leaves after a power cut is cut off."""
+    """Bytes that a file system leaves after a power cut are removed."""
     info = recovered(tmp_path, opened + tail)
     assert in_order(info.path) == WRITTEN
     assert info.damage == Damage(len(tail), 0, 0)
@@ -183,12 +183,12 @@ def test_a_channel_that_only_the_summary_has_is_kept(tmp_path: Path, opened: byt
 
 
 class Killed(BaseException):
-    """What no handler may catch."""
+    """An exception that no handler may catch."""
 
 
 @pytest.mark.parametrize('after', range(5))
 def test_a_killed_recovery_is_repeated(tmp_path: Path, opened: bytes, after: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Recovery that was cut short at any step, also within a write, is done again with the same result."""
+    """Recovery interrupted at any step, also within a write, is repeated with the same result."""
     marked = WRITTEN[A_CHUNK + 1].cdr
     content = opened.replace(marked, bytes(len(marked)))[:-100]
     wanted = recovered(tmp_path, content).path.read_bytes()
@@ -235,7 +235,6 @@ while True:
 
 @pytest.mark.parametrize('after', [1, 3, 20])
 def test_a_killed_writer_loses_nothing_that_was_synced(tmp_path: Path, after: int) -> None:
-    """A process that is killed while it writes has lost nothing of what it had synced."""
     command = [sys.executable, '-c', PROGRAM, str(tmp_path / 'bag_0.mcap')]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, env={**os.environ, 'PYTHONPATH': str(Path(__file__).parents[2])}
@@ -251,7 +250,7 @@ def test_a_killed_writer_loses_nothing_that_was_synced(tmp_path: Path, after: in
 
 
 def test_names_are_kept_apart(tmp_path: Path, opened: bytes) -> None:
-    """A file that is not an open slice is refused, and a whole slice is never written over."""
+    """A file that is not an open slice is refused, and a complete slice is never overwritten."""
     (tmp_path / 'bag_0.mcap.open').write_bytes(opened)
     (tmp_path / 'bag_0.mcap').write_bytes(b'whole')
     with pytest.raises(FileExistsError):
@@ -263,7 +262,6 @@ def test_names_are_kept_apart(tmp_path: Path, opened: bytes) -> None:
 
 
 def test_the_info_of_a_slice_is_what_closing_it_returned(tmp_path: Path) -> None:
-    """The same as closing it returned."""
     info, _ = closed(tmp_path / 'bag_0.mcap', 70, compression='zstd', sync_every=30)
     assert read_info(info.path, digest=True) == info
     assert read_info(info.path).sha256 == ''
@@ -291,7 +289,7 @@ def test_a_bag_of_the_rosbags_package_is_read(tmp_path: Path) -> None:
     {'compression': CompressionType.LZ4, 'enable_crcs': False},
 ], ids=str)  # fmt: skip
 def test_files_of_other_writers_are_read_without_a_complete_summary(tmp_path: Path, options: dict[str, bool]) -> None:
-    """Counts and times are known without statistics, without chunks, without any index: by its messages then."""
+    """Counts and times are known without statistics, without chunks, without any index: then from its messages."""
     path = tmp_path / 'other.mcap'
     with path.open('wb') as file:
         writer = Writer(file, chunk_size=100, **options)  # type: ignore[arg-type]
@@ -310,7 +308,7 @@ def test_files_of_other_writers_are_read_without_a_complete_summary(tmp_path: Pa
 
 @pytest.mark.parametrize('content', [b'', b'no bag', b'\x89MCAP0\r\n' * 30])
 def test_an_incomplete_file_is_named(tmp_path: Path, content: bytes) -> None:
-    """What was cut off, or is something else, is named."""
+    """A truncated or foreign file is named."""
     path = tmp_path / 'bag_0.mcap'
     path.write_bytes(content)
     with pytest.raises(BagDamaged, match='bag_0'):
@@ -335,7 +333,7 @@ def recovered_hostile(folder: Path, content: bytes) -> SliceInfo:
 
 
 def chunk(data: bytes, *, size: int, compression: str = '', crc: int = 0) -> bytes:
-    """A chunk record with these claims."""
+    """A chunk record with these fields."""
     fields = CHUNK.pack(1, 1, size, crc) + text(compression) + struct.pack('<Q', len(data))
     return record(Opcode.CHUNK, fields, data)
 
@@ -348,7 +346,7 @@ def declared() -> bytes:
 @BOUNDED
 @given(st.lists(st.tuples(st.integers(0, 255), NUMBERS, st.binary(max_size=80)), max_size=12))
 def test_records_of_any_kind_leave_a_readable_slice(tmp_path: Path, records: list[tuple[int, int, bytes]]) -> None:
-    """Records with lengths that are lies, or contents that are noise, leave a slice that can be read."""
+    """Records with false lengths, or noise as contents, leave a readable slice."""
     body = b''.join(
         struct.pack('<BQ', op, length if number % 3 == 2 else len(content)) + content
         for number, (op, length, content) in enumerate(records)
@@ -376,7 +374,7 @@ def bomb() -> bytes:
 
 @pytest.mark.parametrize('claimed', [1000, 300 * MEBI, 1 << 60])
 def test_a_chunk_that_unpacks_to_more_takes_no_memory(tmp_path: Path, bomb: bytes, claimed: int) -> None:
-    """What unpacks to more than it claims, or claims more than any chunk has, takes no memory for it."""
+    """Unpacking to more than declared, or declaring more than any chunk has, takes no memory."""
     tracemalloc.start()
     info = recovered_hostile(tmp_path, head() + declared() + chunk(bomb, size=claimed, compression='zstd'))
     peak = tracemalloc.get_traced_memory()[1]
@@ -386,7 +384,7 @@ def test_a_chunk_that_unpacks_to_more_takes_no_memory(tmp_path: Path, bomb: byte
 
 
 def test_a_chunk_as_large_as_its_file_is_not_loaded(tmp_path: Path) -> None:
-    """A record of 2 GB in a file that has as many (nothing but a hole) is not read into memory."""
+    """A record of 2 GB in a sparse file of that size is not read into memory."""
     path = tmp_path / 'bag_0.mcap.open'
     path.write_bytes(head() + struct.pack('<BQ', Opcode.CHUNK, 2 << 30))
     os.truncate(path, len(head()) + 9 + (2 << 30))

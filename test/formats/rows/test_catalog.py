@@ -1,4 +1,4 @@
-"""What the catalog says of an object is what the object says of itself."""
+"""The catalog has the same values for an object as its metadata."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_row_has_all_metadata_of_the_object() -> None:
 
 
 def test_missing_metadata_is_null() -> None:
-    """A foreign object has robot and sensor by its key, its size, and nothing else."""
+    """A foreign object has robot and sensor from its key, its size, and nothing else."""
     found = row({})
     known = {name for name, value in found.items() if value is not None}
     assert known == {'robot', 'sensor', 'bucket', 'key', 'bytes', 'content_type', 'format_version'}
@@ -51,14 +51,14 @@ def test_missing_metadata_is_null() -> None:
 
 @pytest.mark.parametrize('pose', ['', '1 2', '1 2 3', '1 2 x odom', '1 2 nan odom', '1 2 inf odom', '1 2 3 a b'])
 def test_an_incomplete_pose_is_null(pose: str) -> None:
-    """Where any of it is missing or no number, all of it is null."""
+    """If any part of it is missing or not a number, all of it is null."""
     found = row({**TOLD, 'pose': pose})
     assert [found[name] for name in ('x', 'y', 'yaw', 'pose_frame')] == [None] * 4
 
 
 @pytest.mark.parametrize('gps', ['', '1 2', '91 2 3', '1 181 3', '1 nan 3', 'inf 2 3', '1 2 3 4', 'x 2 3'])
 def test_an_invalid_position_is_null(gps: str) -> None:
-    """Whatever a foreign object says; a place whose altitude is unknown is one."""
+    """Whatever a foreign object has; a position without an altitude is valid."""
     found = row({**TOLD, 'gps': gps})
     assert [found[name] for name in ('latitude', 'longitude', 'altitude')] == [None] * 3
     found = row({**TOLD, 'gps': '1 2 nan'})
@@ -76,21 +76,21 @@ def test_a_time_since_boot_has_no_date() -> None:
 
 
 def test_a_slice_of_a_bag_counts_its_messages() -> None:
-    """``messages`` is the count where there is no other."""
+    """``messages`` is the count if there is no other."""
     assert row({'messages': '42'})['count'] == 42
     assert row({'messages': '42', 'count': '7'})['count'] == 7
 
 
 @given(st.dictionaries(st.sampled_from(sorted(TOLD)), st.text()), st.text())
 def test_hostile_metadata_gives_a_valid_row(metadata: dict[str, str], key: str) -> None:
-    """Whatever a foreign writer put there, there is a row with whole numbers of 64 bits, and a folder for it."""
+    """For any foreign values there is a row with 64-bit integers, and a folder for it."""
     found = row(metadata, key)
     assert all(abs(value) < 1 << 63 for value in found.values() if isinstance(value, int))
     assert re.fullmatch(r'\d{4}-\d\d-\d\d', catalog.date_of(found))
 
 
 def test_the_catalog_does_not_list_itself() -> None:
-    """Everything else is, also another bucket's folder of that name."""
+    """Everything else is listed, including another bucket's folder of that name."""
     key = catalog.OBJECTS.part_key('thor', '2025-10-18', '20251018T120100_b00t')
     assert check_key(key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120100_b00t.jsonl.zst'
     assert key.startswith(catalog.OBJECTS.prefix('thor'))

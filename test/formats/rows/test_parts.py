@@ -1,4 +1,4 @@
-"""Row files: what a robot writes reads back, and whatever else is in such a file, the reader survives it and names it."""
+"""Row files: a robot's rows read back, and a reader survives and reports any other content."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ BOMBS: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.parametrize('kind', BOMBS)
 def test_a_bomb_takes_bounded_memory_and_time(kind: str) -> None:
-    """It is named, whatever it decompresses to."""
+    """It is named, whatever size it unpacks to."""
     body = BOMBS[kind]()
     tracemalloc.start()
     started = time.process_time()
@@ -214,7 +214,7 @@ def test_a_part_belongs_to_one_folder() -> None:
 
 
 def test_a_robot_does_not_need_arrow() -> None:
-    """What the node imports to write row files loads none of the libraries that the lake uses."""
+    """The node's imports for writing row files load none of the lake's libraries."""
     program = (
         'import sys; import shadowhound_data_logger.shipping.catalog_writer;'
         'print([name for name in ("pyarrow", "deltalake", "numpy", "boto3", "rclpy") if name in sys.modules])'

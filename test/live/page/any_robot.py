@@ -1,6 +1,6 @@
-"""Program of a test: a robot that is not a Go2, with lidar, map, GPS, cameras of colors and of depth, and texts that are code.
+"""Program of a test: a robot other than a Go2, with lidar, map, GPS, color and depth cameras, and texts that contain code.
 
-The argument is how many topics it has besides.
+The argument is the number of additional topics.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from std_msgs.msg import Float32, String
 HOSTILE = '<img src=x onerror="window.attacked = 1">'
 PERIOD_S = 0.05
 WIDTH, HEIGHT, CELL = 12.0, 8.0, 0.05
-"""Of its room, in meters."""
+"""Size of its room in meters."""
 LATITUDE, LONGITUDE = 47.3769, 8.5417
 DESCRIPTION = """<robot name="turtle"><link name="base_link">
 <visual><geometry><cylinder radius="0.18" length="0.1"/></geometry></visual>
@@ -46,7 +46,7 @@ def room() -> OccupancyGrid:
 
 
 def ranges(x: float, y: float, yaw: float) -> list[float]:
-    """To the walls, all around."""
+    """Distances to the walls in all directions."""
     angles = yaw - math.pi + np.arange(360) * math.pi / 180
     with np.errstate(divide='ignore'):
         to_sides = np.where(np.cos(angles) > 0, WIDTH / 2 - x, -WIDTH / 2 - x) / np.cos(angles)
@@ -55,7 +55,7 @@ def ranges(x: float, y: float, yaw: float) -> list[float]:
 
 
 class Robot(Node):
-    """Publishes all of it."""
+    """Publishes all topics."""
 
     def __init__(self, more: int) -> None:
         super().__init__('turtle')
@@ -80,7 +80,7 @@ class Robot(Node):
         self.publishers_of[topic].publish(message)
 
     def step(self, number: int) -> None:
-        """Twenty times a second."""
+        """Twenty times per second."""
         turn = number * PERIOD_S * 0.25
         x, y, yaw = 3 * math.cos(turn), 2 * math.sin(turn), math.atan2(2 * math.cos(turn), -3 * math.sin(turn))
         odometry, imu = Odometry(), Imu()

@@ -1,4 +1,4 @@
-"""The page in a real Chromium, of a real node and a simulated robot."""
+"""The page in a real Chromium, with a real node and a simulated robot."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 RATES = 'rate_scale:=0.2'
 SHOWN_HZ = {'/imu': 20.0, '/odom': 10.0, '/joint_states': 10.0, '/lowstate': 4.0, '/camera/compressed': 6.0}
-"""What the simulator publishes at that scale, of some topics."""
+"""The simulator's rates at that scale, for some topics."""
 EVENTS = {'events.topics': ['/imu'], 'events.pre_s': 2.0, 'events.post_s': 0.5}
 JOINTS = 'sensor_msgs/msg/JointState'
 pytestmark = [
@@ -43,7 +43,7 @@ pytestmark = [
 
 
 class Watching:
-    """A node, a robot and the live page of them in a browser."""
+    """A node, a robot and their live page in a browser."""
 
     def __init__(self, processes: Processes) -> None:
         self.processes = processes
@@ -59,7 +59,7 @@ class Watching:
         return self.node.ledger()['topics']
 
     def bagged(self) -> int:
-        """Messages that came for bags."""
+        """The messages received for bags."""
         return sum(row['received'] for row in self.node.ledger()['bags'].values())
 
 
@@ -80,7 +80,7 @@ def page(watching: Watching, browser: Browser) -> Page:
 
 
 def test_everything_is_shown(page: Page) -> None:
-    """Camera, cloud, path, plots and figures come; every request goes to the page's own origin; nothing fails in the browser."""
+    """Camera, cloud, path, plots and values appear; every request goes to the page's origin; the browser reports no errors."""
     for kind in ('camera', 'cloud', 'odom', 'imu', 'joints', 'battery', 'figures'):
         holds(page, f'(shadowhound.count[{json.dumps(kind)}] ?? 0) > 3')
     holds(page, 'shadowhound.drawn.camera?.length > 0 && shadowhound.drawn.cloud?.length > 0')
@@ -90,13 +90,13 @@ def test_everything_is_shown(page: Page) -> None:
 
 
 def cell(page: Page, topic: str, field: str) -> float:
-    """What the table says of a topic; NaN for a dash."""
+    """The value in the table for a topic; NaN for a dash."""
     text = page.locator(f'td[data-topic="{topic}"][data-field="{field}"]').inner_text()
     return float(text) if text.replace('.', '').isdecimal() else math.nan
 
 
 def test_the_rates_are_the_robots(page: Page) -> None:
-    """Within a tenth of what is published; what comes ten times a second is at most 0.2 s too old, for two looks of the node."""
+    """Within a tenth of what is published; a topic at 10 Hz is at most 0.2 s older, for two polls of the node."""
 
     def wrong() -> dict[str, tuple[float, float]]:
         found = {}
@@ -118,7 +118,7 @@ def test_a_viewer_has_no_buttons_that_act(page: Page) -> None:
 
 
 def answer_to(page: Page, act: str) -> str:
-    """The node's newest answer on the page, once it is to this; the button can be pressed again then."""
+    """The node's newest response on the page, once it is for this command; the button can be pressed again then."""
     holds(page, f'document.querySelector(".answers li b")?.textContent === {json.dumps(act)}')
     holds(page, 'document.querySelectorAll(".controls button:disabled").length === 0')
     first = page.locator('.answers li').first
@@ -127,7 +127,7 @@ def answer_to(page: Page, act: str) -> str:
 
 
 def test_an_operators_action_reaches_the_node(page: Page, watching: Watching) -> None:
-    """The answer of the node is on the page, and in the node's log stands who asked; the token is in no address."""
+    """The response of the node is on the page, and the node's log names the requester; no URL contains the token."""
     token = (watching.home / 'live' / 'operator.token').read_text().strip()
     press(page.get_by_role('button', name='Sign in', exact=True))
     page.locator('dialog input[name=token]').fill('not-the-token')
@@ -141,7 +141,7 @@ def test_an_operators_action_reaches_the_node(page: Page, watching: Watching) ->
         ('bag start', ''), ('event', 'event_bump_'), ('bag split', 'has 1 closed slices'), ('pause', 'are counted'),
         ('resume', 'messages are stored again'), ('bag stop', ' messages in 2 slices'), ('flush', ' spooled'),
     ):  # fmt: skip
-        if act in {'bag split', 'bag stop'}:  # there is something in the slice
+        if act in {'bag split', 'bag stop'}:  # the slice has messages
             recorded = watching.bagged()
             until(lambda recorded=recorded: watching.bagged() > recorded, 'messages come into the bag')
         press(page.locator(f'[data-act="{act}"]'))
@@ -153,11 +153,11 @@ def test_an_operators_action_reaches_the_node(page: Page, watching: Watching) ->
     assert 'event bump (page)' in watching.node.log
     assert not any(token in url for url in page.asked)
     assert token not in watching.live.log
-    page.wrong.clear()  # the browser's own line about the wrong token (401)
+    page.wrong.clear()  # the browser's message about the wrong token (401)
 
 
 def tabbed(page: Page, selector: str) -> None:
-    """Press Tab until that has the focus, as one sees."""
+    """Press Tab until the element has the focus."""
     for _ in range(80):
         page.keyboard.press('Tab')
         if page.evaluate(f'document.activeElement.matches({json.dumps(selector)})'):
@@ -167,7 +167,7 @@ def tabbed(page: Page, selector: str) -> None:
 
 
 def test_the_page_works_with_the_keyboard(page: Page) -> None:
-    """A button that Tab leads to acts, by space as by enter; on the timeline arrows move the moment by one second and by ten."""
+    """A button with the focus reacts to space and enter; arrows on the timeline move the time by one second and by ten."""
     page.evaluate('document.activeElement.blur()')
     for act, key in (('pause', 'Space'), ('resume', 'Enter')):
         page.locator(f'[data-act={act}]').wait_for()
@@ -191,14 +191,14 @@ def test_the_page_works_with_the_keyboard(page: Page) -> None:
 
 
 def test_motion_and_colors_are_as_the_user_wants_them(page: Page) -> None:
-    """Nothing moves by itself for who asked for that; and the page is dark in a dark system."""
+    """With reduced motion nothing moves automatically; and the page is dark on a dark system."""
     moving = """() => [...document.querySelectorAll('*')].filter((each) => {
         const style = getComputedStyle(each);
         return style.animationName !== 'none' || !/^0s(, 0s)*$/.test(style.transitionDuration) || style.scrollBehavior !== 'auto';
     }).map((each) => each.tagName)"""
     try:
         page.emulate_media(reduced_motion='no-preference')
-        assert page.evaluate(moving) == ['HTML']  # it scrolls smoothly to the part that was clicked
+        assert page.evaluate(moving) == ['HTML']  # it scrolls smoothly to the clicked part
         page.emulate_media(reduced_motion='reduce')
         assert page.evaluate(moving) == []
         assert page.evaluate('document.getAnimations().length') == 0
@@ -217,7 +217,7 @@ def test_motion_and_colors_are_as_the_user_wants_them(page: Page) -> None:
 
 @pytest.fixture
 def graph(watching: Watching) -> Iterator[Any]:
-    """A node of ROS that sees those of the robot."""
+    """A ROS node that discovers those of the robot."""
     import rclpy
 
     context = rclpy.Context()
@@ -229,7 +229,7 @@ def graph(watching: Watching) -> Iterator[Any]:
 
 
 def test_a_hidden_tab_has_no_subscriptions(page: Page, watching: Watching, graph: Any) -> None:
-    """Its subscriptions end, as ROS sees them, and begin again when it is seen."""
+    """Its subscriptions end, according to ROS, and start again when it is visible."""
 
     def is_read(topic: str) -> bool:
         return any(each.node_name == 'shadowhound_live' for each in graph.get_subscriptions_info_by_topic(topic))
@@ -248,7 +248,7 @@ def test_a_hidden_tab_has_no_subscriptions(page: Page, watching: Watching, graph
 
 
 def test_the_page_takes_no_shared_memory_for_images(watching: Watching) -> None:
-    """It publishes none, and does not load our profile, which its environment names."""
+    """It publishes none, and does not load our profile named in its environment."""
     if SHIPPED not in Path(f'/proc/{watching.live.popen.pid}/environ').read_text():
         pytest.skip('the tests run without our profile here')
     segments = locked(watching.live.popen.pid, '[0-9a-f]{16}')
@@ -258,7 +258,7 @@ def test_the_page_takes_no_shared_memory_for_images(watching: Watching) -> None:
 
 
 def test_after_a_kill_the_page_reconnects(page: Page, watching: Watching) -> None:
-    """Without a reload and without a new sign-in; meanwhile everything is marked as old, and the ages go on growing."""
+    """Without a reload or a new sign-in; until then everything is marked as old, and the ages keep growing."""
     port = int(watching.url.rstrip('/').rpartition(':')[2])
     watching.live.signal(signal.SIGKILL)
     watching.live.wait()
@@ -270,11 +270,11 @@ def test_after_a_kill_the_page_reconnects(page: Page, watching: Watching) -> Non
     watching.serve(port)
     holds(page, f'shadowhound.count.camera > {before}')
     page.locator('[data-act="flush"]').wait_for()
-    page.wrong.clear()  # what the browser says of connections that were refused
+    page.wrong.clear()  # the browser's messages about refused connections
 
 
 def test_the_figures_are_those_of_the_ledger(page: Page, watching: Watching) -> None:
-    """Once the robot is silent: received, stored and missed of each topic, as ``ledger --json`` has them."""
+    """Once the robot is silent: received, stored and missed of each topic, as in ``ledger --json``."""
     watching.sim.signal(signal.SIGINT)
     watching.sim.wait()
     press(page.locator('[data-act="flush"]'))
@@ -301,7 +301,7 @@ def test_the_figures_are_those_of_the_ledger(page: Page, watching: Watching) -> 
 
 
 def test_the_age_of_a_silent_topic_is_the_publishers(page: Page, watching: Watching) -> None:
-    """Within 200 ms, counted from the last message that was published, whenever that was between two polls of the node."""
+    """Within 200 ms, counted from the last published message, whenever that was between two polls of the node."""
     watching.sim.signal(signal.SIGINT)
     watching.sim.wait()
     turned = np.array([0.5])
@@ -309,7 +309,7 @@ def test_the_age_of_a_silent_topic_is_the_publishers(page: Page, watching: Watch
     publisher = watching.processes.publisher()
     publisher.create('/joint_states', JOINTS)
     publisher.heard('/joint_states', watching.node, message)
-    for phase_s in (0.17, 0.05):  # the last one comes just after a poll, and just before one
+    for phase_s in (0.17, 0.05):  # the last message is just after a poll, and just before one
         until(lambda phase_s=phase_s: (time.time() - phase_s) % POLL_S < 0.02, 'it is time')
         publisher.publish('/joint_states', [message] * 60, 0.05)
         sent_s = time.monotonic()
@@ -318,24 +318,24 @@ def test_the_age_of_a_silent_topic_is_the_publishers(page: Page, watching: Watch
             silent_s = time.monotonic() - sent_s
             return silent_s > 0.5 and abs(cell(page, '/joint_states', 'age') - silent_s) < 0.3
 
-        until(is_told, lambda: f'the page tells its age: {cell(page, "/joint_states", "age")}', 10.0)
+        until(is_told, lambda: f'the age on the page: {cell(page, "/joint_states", "age")}', 10.0)
         wrong_s = []
         while time.monotonic() < sent_s + 5.0:
             before_s = time.monotonic()
             age_s, after_s = cell(page, '/joint_states', 'age'), time.monotonic()
             wrong_s.append(max(0.0, abs(age_s - ((before_s + after_s) / 2 - sent_s)) - (after_s - before_s) / 2))
-        print(f'its age differs by at most {most_of(wrong_s) * 1e3:.0f} ms from the truth')  # noqa: T201 - for whoever measures
+        print(f'its age differs by at most {most_of(wrong_s) * 1e3:.0f} ms from the truth')  # noqa: T201 - a measurement
         assert most_of(wrong_s) <= 0.2
     publisher.end()
 
 
 def test_a_gap_is_on_the_timeline_at_its_time(page: Page, watching: Watching) -> None:
-    """What was published while the node was away, by the cause restart, and whatever else ``ledger --gaps`` tells."""
+    """Messages published while the node was down, with cause restart, and the other gaps of ``ledger --gaps``."""
     watching.sim = watching.processes.sim(RATES)
     received = watching.node.topic('/imu')['received']
     watching.node.received('/imu', received + 20)
     watching.node.kill()
-    time.sleep(3.0)  # for this long messages are lost: it is what is tested
+    time.sleep(3.0)  # messages are lost for this long, which is what is tested
     watching.node = watching.processes.node(parameters=EVENTS)
     received = watching.node.topic('/imu')['received']
     watching.node.received('/imu', received + 20)
@@ -344,7 +344,7 @@ def test_a_gap_is_on_the_timeline_at_its_time(page: Page, watching: Watching) ->
     watching.sim.wait()
 
     def lacks() -> list[dict[str, Any]]:
-        """What ``ledger --gaps`` has and the page has not."""
+        """Gaps of ``ledger --gaps`` that the page does not have."""
         command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'ledger', '--gaps', '--json']
         environ = {**watching.processes.environ, 'SHADOWHOUND_HOME': str(watching.home), 'SHADOWHOUND_ROBOT': watching.node.robot}
         ran = subprocess.run(command, env=environ, capture_output=True, text=True, check=True, timeout=120)
@@ -366,10 +366,10 @@ def test_a_gap_is_on_the_timeline_at_its_time(page: Page, watching: Watching) ->
 
 @pytest.mark.slow
 def test_a_click_on_the_timeline_shows_that_moment(page: Page, watching: Watching, tmp_path: Path) -> None:
-    """A click on the timeline shows that moment: frame, cloud, path and plots of then; it plays on from there.
+    """A click on the timeline shows that time: frame, cloud, path and plots; playback continues from there.
 
-    The commands that the page tells run as they stand there, once the catalog of that minute has arrived: query finds it, fetch
-    and bag cut give files.
+    The commands on the page work unchanged, once the catalog of that minute has arrived: query finds the data, fetch and bag cut
+    create files.
     """
     press(page.get_by_role('button', name='Back in time'))
     holds(page, '(shadowhound.past?.count ?? 0) > 0')
@@ -389,9 +389,9 @@ def test_a_click_on_the_timeline_shows_that_moment(page: Page, watching: Watchin
     before = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
     press(page.locator('[data-play]'))
     holds(page, f'shadowhound.past.at > {before + 1000}')
-    print(f'{played(page, 5)[0]:.1f} moments a second of camera, cloud and plots')  # noqa: T201 - for whoever measures
+    print(f'{played(page, 5)[0]:.1f} moments a second of camera, cloud and plots')  # noqa: T201 - a measurement
     press(page.locator('[data-play]'))
-    assert counted(page, 'imu') <= live + 3  # nobody watches the live topics meanwhile
+    assert counted(page, 'imu') <= live + 3  # no viewer watches the live topics during that time
     home = {**watching.processes.environ, 'SHADOWHOUND_HOME': str(watching.home)}
     query = shlex.split(page.locator('[data-command=query]').inner_text())
     assert query[0] == 'shadowhound-data'
@@ -409,7 +409,7 @@ def test_a_click_on_the_timeline_shows_that_moment(page: Page, watching: Watchin
     ]
     of_bag = page.locator(f'[data-mark=bag][data-name="{bag}"] rect')
     cut = page.locator('[data-command="bag cut"]', has_text=bag)
-    for minutes in (15, 1):  # by a click on the bag; the second time there is little else on the timeline
+    for minutes in (15, 1):  # by a click on the bag; the second time the timeline has little besides it
         press(page.get_by_role('button', name=f'{minutes} min', exact=True))
         at_ms = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
         for end, there in (('Min', at_ms - minutes * 30_000), ('Max', at_ms + minutes * 30_000)):
@@ -430,14 +430,14 @@ def test_a_click_on_the_timeline_shows_that_moment(page: Page, watching: Watchin
 
 
 def test_nothing_is_wider_than_the_screen(page: Page) -> None:
-    """Of the page of the robot, as it is after all of this, on a laptop and on phones."""
+    """The robot's page, after all of these tests, on a laptop and on phones."""
     for width in (1440, 390, 320):
         fits(page, width)
     page.set_viewport_size({'width': 1280, 'height': 800})
 
 
 def test_a_lost_first_request_is_repeated(browser: Browser, watching: Watching) -> None:
-    """On a bad link the page may be there, and what it asks first is not answered."""
+    """On a bad link the page may load, and its first request may get no response."""
     page: Any = browser.new_page()
     lost: list[str] = []
 

@@ -1,4 +1,4 @@
-"""The page of a store while its S3 server is away, in a real Chromium with a real SeaweedFS."""
+"""The page of a store with an unreachable S3 server, in a real Chromium with a real SeaweedFS."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 @pytest.mark.long('a Chromium and an S3 server')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_the_page_survives_an_outage_of_the_store(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It says what cannot be reached, keeps what it shows, and goes on without a reload once the server is back."""
+    """It reports what cannot be reached, keeps its contents, and continues without a reload once the server responds again."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     with Tower(tmp_path / 'tower') as tower:
         for name, value in tower.environment().items():
@@ -46,7 +46,7 @@ def test_the_page_survives_an_outage_of_the_store(browser: Browser, tmp_path: Pa
             page.evaluate('window.same = true')
             frames = page.evaluate('shadowhound.past.count')
             tower.stop_s3()
-            served.run(served.server.past.history._end())  # what it has read already would do for a while
+            served.run(served.server.past.history._end())  # data already read would be enough for a while
             press(page.get_by_role('button', name='10 seconds back'))
             page.locator('.timeline [role=alert]').first.wait_for()
             said = page.locator('.timeline [role=alert]').first.inner_text()
@@ -66,14 +66,14 @@ def test_the_page_survives_an_outage_of_the_store(browser: Browser, tmp_path: Pa
 @pytest.mark.long('a Chromium, a robot and a node')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_the_page_reconnects_after_an_outage(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the link, of which nobody is told: the page goes on by itself within 2 s, without a reload.
+    """After a silent outage of the link: the page continues within 2 s, without a reload.
 
-    The ages that it shows meanwhile are within 200 ms of the truth: when the publisher sent the message that is shown.
+    The ages that it shows in between are within 200 ms of the truth: when the publisher sent the message shown.
     """
     sent_s: list[float] = []
 
     def numbered() -> list[LiveItem]:
-        """A message whose roll is its number, in degrees."""
+        """A message with its number as roll, in degrees."""
         sent_s.append(time.monotonic())
         return [table_item('/imu', KINDS[IMU], [(sent_s[-1] * 1e3, {'rpy.x': math.radians(len(sent_s) - 1)})])]
 
@@ -103,17 +103,17 @@ def test_the_page_reconnects_after_an_outage(browser: Browser, tmp_path: Path, m
             age_ms = page.evaluate("Number(document.querySelector('[data-age=imu]').dataset.ms)")
             shown.append((before_s, time.monotonic(), age_ms / 1e3))
         number = int(float(page.locator('section[aria-label=Attitude] .legend b').first.inner_text()))
-        assert cut_s - 1.5 < sent_s[number] <= cut_s  # the last one that came through
+        assert cut_s - 1.5 < sent_s[number] <= cut_s  # the last one that arrived
         at_s = sent_s[number]
         wrong_s = [max(before_s - at_s - age_s, age_s - (after_s - at_s)) for before_s, after_s, age_s in shown]
-        print(f'ages differ by at most {most_of(wrong_s) * 1e3:.0f} ms from the truth, in {len(wrong_s)} looks')  # noqa: T201 - for whoever measures
+        print(f'ages differ by at most {most_of(wrong_s) * 1e3:.0f} ms from the truth, in {len(wrong_s)} looks')  # noqa: T201 - a measurement
         assert most_of(wrong_s) <= 0.2
-        assert len(tried) > 3  # it waits for no connection that TCP still tries to revive
+        assert len(tried) > 3  # it does not wait for a connection that TCP still retries
         count = counted(page, 'imu')
         machines.mend()
         mended_s = time.monotonic()
         holds(page, f'shadowhound.count.imu > {count}')
-        print(f'it went on after {time.monotonic() - mended_s:.2f} s')  # noqa: T201 - for whoever measures
+        print(f'it continued after {time.monotonic() - mended_s:.2f} s')  # noqa: T201 - a measurement
         assert time.monotonic() - mended_s <= 2.0
         assert page.evaluate('window.same')
 
@@ -122,7 +122,7 @@ def test_the_page_reconnects_after_an_outage(browser: Browser, tmp_path: Path, m
 @pytest.mark.long('a Chromium, a robot and a node')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An open page says so and tries no more connections; with the new token it goes on, without a reload."""
+    """An open page reports it and stops connecting; with the new token it continues, without a reload."""
     settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind='0.0.0.0', port=0)
     served = Served(settings, monkeypatch)
     try:
@@ -140,7 +140,7 @@ def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path:
         make_tokens(tmp_path / 'live', replace=True)
         page.get_by_text('Your sign-in has ended.').wait_for()
         before = len(tried)
-        page.wait_for_timeout(4000)  # it would have tried three times
+        page.wait_for_timeout(4000)  # it would have tried three times by then
         assert len(tried) == before
         count = counted(page, 'figures')
         sign_in()
@@ -156,7 +156,7 @@ def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path:
 @pytest.mark.long('a Chromium, a robot and a node')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_a_viewer_becomes_an_operator(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sign-in of before ends, and its connection with it; the page goes on by the new one, without a reload."""
+    """The previous sign-in ends along with its connection; the page continues with the new one, without a reload."""
     monkeypatch.setattr(server_module, 'CHECK_S', 0.2)
     settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind='0.0.0.0', port=0)
     served = Served(settings, monkeypatch)
@@ -187,7 +187,7 @@ def test_a_viewer_becomes_an_operator(browser: Browser, tmp_path: Path, monkeypa
 def test_where_everybody_may_watch_an_operator_becomes_a_viewer(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once the sign-in has ended: the page has no button that acts any more, and goes on."""
+    """Once the sign-in has ended, the page has no operator buttons any more, and continues."""
     served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
     try:
         page = opened(browser, served.server.url)
@@ -195,7 +195,7 @@ def test_where_everybody_may_watch_an_operator_becomes_a_viewer(
         page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
         press(page.locator('dialog button.primary'))
         page.locator('[data-act=flush]').wait_for()
-        page.reload()  # with the cookie, by which the connection is known
+        page.reload()  # with the cookie that identifies the connection
         page.locator('[data-act=flush]').wait_for()
         make_tokens(tmp_path / 'live', replace=True)
         page.locator('[data-act=flush]').wait_for(state='detached')

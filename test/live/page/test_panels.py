@@ -1,4 +1,4 @@
-"""The page of a robot that is not a Go2, in a real Chromium: what it publishes is shown, without any settings."""
+"""The page of a robot other than a Go2, in a real Chromium: everything it publishes is shown, without any settings."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ pytestmark = [
 ]
 PROGRAM = Path(__file__).with_name('any_robot.py')
 MORE = 510
-"""Topics besides, before all others in the alphabet."""
+"""Additional topics, first in alphabetical order."""
 TF, FIX = 'tf2_msgs/msg/TFMessage', 'sensor_msgs/msg/NavSatFix'
 
 
 class Watching:
-    """A robot, a node and the page of them."""
+    """A robot, a node and their page."""
 
     def __init__(self, processes: Processes) -> None:
         self.processes = processes
@@ -76,13 +76,13 @@ def text(page: Page, selector: str) -> str:
 
 
 def inspect(page: Page, topic: str) -> None:
-    """Show its newest message, or end that; it is found by its name."""
+    """Show its newest message, or stop; it is found by its name."""
     page.get_by_label('Search topics and types').fill(topic)
     press(page.locator(f'[data-inspect="{topic}"]'))
 
 
 def test_each_standard_type_has_its_panel(page: Page) -> None:
-    """Scan, map, model, GPS, diagnostics and log come, beside camera and plots; nothing fails in the browser."""
+    """Scan, map, model, GPS, diagnostics and log appear, in addition to camera and plots; there are no errors in the browser."""
     for kind in ('camera', 'scan', 'map', 'model', 'odom', 'imu', 'joints', 'battery', 'fix', 'diagnostics', 'rosout'):
         holds(page, f'(shadowhound.count[{json.dumps(kind)}] ?? 0) > 0')
     panels = page.locator('section.view').evaluate_all('all => all.map(one => one.ariaLabel)')
@@ -93,7 +93,7 @@ def test_each_standard_type_has_its_panel(page: Page) -> None:
 
 
 def test_gps_is_exact(page: Page) -> None:
-    """Within the circle that the robot drives, to a tenth of a meter."""
+    """Within the circle that the robot drives, to 0.1 m."""
     holds(page, 'document.querySelector("[data-field=lat]")?.textContent.length > 9')
     latitude, longitude = (float(text(page, f'[data-field={name}]')) for name in ('lat', 'lon'))
     assert abs(((latitude - LATITUDE) / 9e-6 / 2) ** 2 + ((longitude - LONGITUDE) / 1.3e-5 / 3) ** 2 - 1) < 0.1
@@ -117,7 +117,7 @@ def test_texts_of_the_robot_are_text(page: Page) -> None:
 
 
 def test_an_unpublished_topic_is_listed_last(page: Page) -> None:
-    """The node subscribes to those of a Go2. Of more than 500 topics none is cut that has a publisher, and any can be found."""
+    """The node subscribes to those of a Go2. Of more than 500 topics none with a publisher is cut, and any can be found."""
     page.get_by_label('Search topics and types').fill('')
     holds(page, 'document.querySelectorAll("[data-inspect]").length > 50')
     names = page.locator('[data-inspect]').evaluate_all('all => all.map(one => one.dataset.inspect)')
@@ -137,7 +137,7 @@ def test_an_unpublished_topic_is_listed_last(page: Page) -> None:
 
 
 def test_a_number_of_a_message_is_plotted(page: Page, watching: Watching) -> None:
-    """By a click on it, also an element of an array that is not shown; until then nobody subscribes to the topic."""
+    """By a click on it, also for an element of an array that is not shown; before that nothing subscribes to the topic."""
     inspect(page, '/scan')
     holds(page, 'document.querySelectorAll("[data-path]").length > 30')
     press(page.locator('[data-path="ranges[3]"]'))
@@ -157,7 +157,7 @@ def test_a_number_of_a_message_is_plotted(page: Page, watching: Watching) -> Non
 
 
 def test_cameras_are_side_by_side_and_depth_has_a_scale(page: Page) -> None:
-    """Up to all that there are; the scale has its unit."""
+    """Up to the number available; the scale has its unit."""
     for count in (1, 2):
         press(page.get_by_label('Another camera beside this one'))
         holds(page, f'document.querySelectorAll(".camera.other").length === {count}')
@@ -185,7 +185,7 @@ def test_the_layout_is_remembered_for_the_robot(page: Page) -> None:
 
 
 def test_the_page_fits_on_a_phone(page: Page) -> None:
-    """With all of this."""
+    """With everything open."""
     for width in (1440, 390):
         fits(page, width)
     page.set_viewport_size({'width': 1280, 'height': 800})
@@ -194,7 +194,7 @@ def test_the_page_fits_on_a_phone(page: Page) -> None:
 
 
 def test_the_cost_of_many_topics_is_bounded(page: Page, watching: Watching) -> None:
-    """The page subscribes to what is shown, and not to the other 500."""
+    """The page subscribes to the visible topics, and not to the other 500."""
     import rclpy
 
     context = rclpy.Context()
@@ -202,7 +202,7 @@ def test_the_cost_of_many_topics_is_bounded(page: Page, watching: Watching) -> N
     node = rclpy.create_node('observer', context=context, start_parameter_services=False, enable_rosout=False)
 
     def read() -> set[str]:
-        with suppress(RuntimeError):  # the page is not seen yet
+        with suppress(RuntimeError):  # the page is not visible yet
             return {topic for topic, _ in node.get_subscriber_names_and_types_by_node('shadowhound_live', '/')}
         return set()
 
@@ -217,7 +217,7 @@ def test_the_cost_of_many_topics_is_bounded(page: Page, watching: Watching) -> N
 
 
 def test_transforms_place_robot_and_sensors(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From map to base: the robot is where they say, and a sensor whose frame is in none says so."""
+    """From map to base: the robot is where they place it, and a sensor with an unknown frame is reported."""
     served = Served(LiveSettings(spool=tmp_path / 'spool', robot='turtle', tokens=tmp_path / 'live', port=0), monkeypatch)
     panel = panel_of('/tf', TF)
     assert panel is not None
@@ -246,7 +246,7 @@ def test_transforms_place_robot_and_sensors(browser: Browser, tmp_path: Path, mo
 
 
 def test_a_link_leads_to_a_moment(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The address names the moment that is shown; who opens it sees that moment."""
+    """The URL contains the displayed time; opening it shows that time."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
@@ -269,7 +269,7 @@ def test_a_link_leads_to_a_moment(browser: Browser, tmp_path: Path, monkeypatch:
 
 
 def test_the_page_of_a_store_becomes_a_robots_when_a_node_starts(browser: Browser, tmp_path: Path) -> None:
-    """It says what it is waiting for, and changes in the browser without help."""
+    """It shows what it waits for, and changes in the browser automatically."""
     pytest.importorskip('rclpy')
     with free_domain() as domain:
         processes = Processes(tmp_path, domain, f'r{secrets.token_hex(4)}')
@@ -290,7 +290,7 @@ def test_the_page_of_a_store_becomes_a_robots_when_a_node_starts(browser: Browse
 def test_three_dimensions_are_loaded_when_they_are_in_view(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two thirds of the page's bytes; on a phone the camera and the button for this moment come first, and one finger scrolls."""
+    """Two thirds of the page's bytes; on a phone the camera and the save button come first, and one finger scrolls."""
     served = Served(LiveSettings(spool=tmp_path / 'spool', robot='turtle', tokens=tmp_path / 'live', port=0), monkeypatch)
     try:
         phone = browser.new_context(viewport={'width': 390, 'height': 420}, has_touch=True, is_mobile=True)
@@ -316,7 +316,7 @@ def test_three_dimensions_are_loaded_when_they_are_in_view(
 def test_tiles_come_from_the_server_that_the_operator_names(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiles: str
 ) -> None:
-    """And from nowhere if none is named; the page may load pictures from that server alone."""
+    """And from nowhere if none is named; the page may load images from that server alone."""
     settings = LiveSettings(spool=tmp_path / 'spool', robot='turtle', tokens=tmp_path / 'live', port=0, tiles=tiles)
     served = Served(settings, monkeypatch)
     rest = {'lat_rest': 0.0, 'lon_rest': 0.0, 'altitude': 1.0, 'status': 0.0, 'error': 1.0}

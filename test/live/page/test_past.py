@@ -32,7 +32,7 @@ pytestmark = [
 
 
 def minute(store: ObjectStore, folder: Path) -> None:
-    """A minute of camera at 5 Hz and odometry, and the part that tells of it."""
+    """A minute of camera at 5 Hz and odometry, and the part with their rows."""
     rows = []
     for number in range(300):
         rows.append(told(number / 5, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg'))
@@ -46,7 +46,7 @@ def minute(store: ObjectStore, folder: Path) -> None:
 
 @pytest.mark.slow
 def test_playback_reads_ahead(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a recorded minute some six moments a second are shown at its own pace, though each takes 0.08 s more to be read."""
+    """Playback in real time shows about six times per second of a recording, though each takes 0.08 s longer to read."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
@@ -78,8 +78,8 @@ def test_playback_reads_ahead(browser: Browser, tmp_path: Path, monkeypatch: pyt
         holds(page, f'Math.abs(shadowhound.past.at - {at_ms}) < 1')
         press(page.locator('[data-play]'))
         hz, pace = played(page, 10)
-        print(f'{hz:.1f} moments a second, at {pace:.2f} of the pace of a clock')  # noqa: T201 - for whoever measures
-        # Six to seven on a machine with little else to do. Two busy cores may let the browser wait, and take long to read.
+        print(f'{hz:.1f} moments a second, at {pace:.2f} of the pace of a clock')  # noqa: T201 - a measurement
+        # Six to seven on an idle machine. A busy one may delay the browser, and take long to read.
         assert hz >= min(4.5, 0.8 / statistics.median(took_s))
         assert 0.9 <= pace <= 1.1
         is_ahead = [page.evaluate('shadowhound.past.at') < wanted_ms[-1] for _ in range(100)]
@@ -91,7 +91,7 @@ def test_playback_reads_ahead(browser: Browser, tmp_path: Path, monkeypatch: pyt
 
 
 def played(page: Page, seconds: int) -> tuple[float, float]:
-    """Moments a second while it plays, and how much time passes on the page in a second."""
+    """Displayed times per second during playback, and the time that passes on the page per second."""
     script = """async (seconds) => {
         const now = () => [shadowhound.past.count, shadowhound.past.at, performance.now()];
         const [count, at, began] = now();
@@ -104,7 +104,7 @@ def played(page: Page, seconds: int) -> tuple[float, float]:
 
 
 def test_the_past_is_shown_by_arrival(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of frames whose stamps are behind: timeline, moment and command are of the time that was chosen, and so are their ages."""
+    """For frames with old stamps: timeline, time and command follow the selected clock, and so do their ages."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
@@ -132,7 +132,7 @@ def test_the_past_is_shown_by_arrival(browser: Browser, tmp_path: Path, monkeypa
 def test_the_page_of_a_store_shows_the_past_without_a_robot(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without a robot: the last day, a moment of it, and labels that an operator adds to it; names in it are text."""
+    """Without a robot: the last day, a time in it, and labels that an operator adds to it; names in it are text."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:

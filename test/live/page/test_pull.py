@@ -24,7 +24,7 @@ pytestmark = [
 
 
 def test_an_operator_requests_kept_data(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the page of a store: how much of a time is on the robot alone, asking for it, and what became of that."""
+    """On the page of a store: how much of a time is only on the robot, a request for it, and its result."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(Field(tmp_path)) as field:

@@ -1,4 +1,4 @@
-"""The timeline of the live page in a real Chromium, of a store: zoom, pan, selection, gaps in words, jumps and pieces of bags."""
+"""The timeline of the live page in a real Chromium, for a store: zoom, pan, selection, gaps as text, jumps and cuts of bags."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BAG = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
 
 
 def test_each_cause_has_a_remedy() -> None:
-    """For every cause that the code knows the page says what to do."""
+    """The page has a remedy for every cause that the code knows."""
     source = (PAGE / 'gaps.js').read_text()
     known = set(re.findall(r'^  (\w+): ', source.partition('const REMEDIES')[2].partition('};')[0], re.MULTILINE))
     assert set(CAUSES) | {'unknown'} <= known | {'EntityTooLarge'}
@@ -48,7 +48,7 @@ def in_chromium(test: Any) -> Any:
 
 @pytest.fixture
 def page(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Page]:
-    """Ten seconds of a mission, a second without the IMU in it, and a bag of an event ten seconds later."""
+    """Ten seconds of a mission, with one second without the IMU, and a bag of an event ten seconds later."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     settings = folder_store(tmp_path)
@@ -70,14 +70,14 @@ def page(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 
 def shown(page: Page) -> tuple[int, int, int]:
-    """Begin and end of the timeline and the moment, in ms after noon."""
+    """Start and end of the timeline and the selected time, in ms after noon."""
     slider = page.locator('svg[role=slider]')
     begin, end, now = (int(slider.get_attribute(f'aria-value{name}') or 0) - NOON_MS for name in ('min', 'max', 'now'))
     return begin, end, now
 
 
 def at(page: Page, ms: float) -> tuple[float, float]:
-    """Where a time is on the screen, on the last row of the timeline."""
+    """The position of a time on the screen, on the last row of the timeline."""
     begin, end, _ = shown(page)
     page.locator('svg[role=slider]').scroll_into_view_if_needed()
     box = page.locator('svg[role=slider]').bounding_box()
@@ -103,7 +103,7 @@ def moment_is(page: Page, ms: int) -> None:
 
 @in_chromium
 def test_the_timeline_opens_at_the_data_and_zooms_and_pans(page: Page) -> None:
-    """Half a minute is not a line in a day; wheel, drag, keys and buttons change what is shown, around the pointer."""
+    """30 s are more than a line in a day; wheel, drag, keys and buttons change the visible range, around the pointer."""
     begin, end, _ = shown(page)
     assert -2000 <= begin < 0
     assert 19_000 < end < 27_000
@@ -130,7 +130,7 @@ def test_the_timeline_opens_at_the_data_and_zooms_and_pans(page: Page) -> None:
 
 @in_chromium
 def test_a_gap_is_drawn_and_described(page: Page) -> None:
-    """A click goes to the last message before it: what was lost, why, what to do; jumps go there too; hostile causes are text."""
+    """A click selects the last message before it: what was lost, why, the remedy; jumps do too; hostile causes are text."""
     gap = page.locator('rect.gap[data-topic="/imu"]').bounding_box()
     assert gap is not None
     page.mouse.click(gap['x'] + gap['width'] / 2, gap['y'] + 4)
@@ -179,7 +179,7 @@ def test_a_line_breaks_where_data_is_missing(page: Page, steps_s: list[float], b
 
 @in_chromium
 def test_a_selection_offers_its_commands_and_a_piece_of_the_bag(page: Page, tmp_path: Path) -> None:
-    """By shift and drag, and by keys; the piece is an MCAP file with the messages of that time, which other viewers may open."""
+    """By shift and drag, and by keys; the cut is an MCAP file with the messages of that time, which other viewers can open."""
     dragged(page, 2000, 21_500, 'Shift')
     holds(page, 'document.querySelector("[data-selected]") !== null')
     begin, end = (int(each) - NOON_MS for each in (page.locator('[data-selected]').get_attribute('data-selected') or '').split())
@@ -217,7 +217,7 @@ def test_a_selection_offers_its_commands_and_a_piece_of_the_bag(page: Page, tmp_
 
 @in_chromium
 def test_losses_are_shown_until_acknowledged(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the last day, or since they were acknowledged, which this browser keeps; the row of the topic is no alarm any more."""
+    """Of the last day, or since the acknowledgment, which this browser stores; the row of the topic is no longer an alarm."""
     now_ms = time.time() * 1e3
     columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']
     gaps = [['objects', '/imu', 'missed', 'restart', now_ms - 600_000, now_ms - 590_000, 12, 'exact'],
@@ -249,7 +249,7 @@ def test_losses_are_shown_until_acknowledged(browser: Browser, tmp_path: Path, m
 
 @in_chromium
 def test_the_live_view_begins_with_what_was_recorded(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plots and path of the time before the page was opened, from the spool, though nothing comes now."""
+    """Plots and path of the time before the page was opened, from the spool, though no messages arrive now."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     spool = new_spool(tmp_path / 'spool', FakeClock())
     spool.open()
@@ -290,7 +290,7 @@ BLINDNESS = {
     'deutan': ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.011820, 0.042940, 0.968881)),
     'tritan': ((1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.303900)),
 }
-"""What such an eye sees of linear RGB: Machado, Oliveira and Fernandes (2009), severity 1."""
+"""Linear RGB as seen with this deficiency: Machado, Oliveira and Fernandes (2009), severity 1."""
 
 
 def seen(color: str, kind: str) -> Any:
@@ -306,7 +306,7 @@ def seen(color: str, kind: str) -> Any:
 @pytest.mark.long('a Chromium, a robot and a node')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_each_cause_of_a_gap_has_its_own_color(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hue and pattern: on the timeline as in the legend, for words of a server too; most hues differ for the color-blind too."""
+    """Hue and pattern, on the timeline as in the legend, also for a server's causes; most hues differ for the color-blind too."""
     causes = sorted({*CAUSES, 'unknown', 'EntityTooLarge', 'InvalidObjectState'})
     now_ms = time.time() * 1e3
     columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']
@@ -344,11 +344,11 @@ def test_each_cause_of_a_gap_has_its_own_color(browser: Browser, tmp_path: Path,
 
 
 APART = 20.0
-"""Between two hues, in CIE Lab: what one just sees is 2.3."""
+"""The distance between two hues, in CIE Lab: the smallest noticeable one is 2.3."""
 
 
 def page_rgb(page: Page, name: str) -> str:
-    """A color of the style sheet as it is computed."""
+    """The computed value of a color of the style sheet."""
     script = """name => {
         const probe = document.body.appendChild(document.createElement('i'));
         probe.style.color = `var(${name})`;

@@ -1,4 +1,4 @@
-"""What the page says can be understood without the documentation: each figure has its definition, also on a phone."""
+"""The page can be understood without the documentation: each value has its definition, also on a phone."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def values() -> list[LiveItem]:
 
 @pytest.fixture
 def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """The page of a robot with every figure."""
+    """The page of a robot with every value."""
     with ExitStack() as stack:
         settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0)
         served = Served(settings, monkeypatch)
@@ -62,7 +62,7 @@ def undefined(page: Page) -> list[str]:
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_every_figure_of_the_live_page_has_a_definition(browser: Browser, robot: Served) -> None:
-    """As the tooltip of the figure, or of what it is part of."""
+    """As the tooltip of the value, or of its container."""
     page = opened(browser, robot.server.url)
     holds(page, 'shadowhound.count.fix > 3 && document.querySelectorAll("[data-field=policy]").length === 1')
     assert page.evaluate(f"document.querySelectorAll('{FIGURES}').length") > 40
@@ -73,7 +73,7 @@ def test_every_figure_of_the_live_page_has_a_definition(browser: Browser, robot:
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_every_figure_of_the_past_has_a_definition(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a store: the table of robots, and what a robot keeps."""
+    """Of a store: the table of robots, and the data kept by a robot."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(Field(tmp_path)) as field:
@@ -91,7 +91,7 @@ def test_every_figure_of_the_past_has_a_definition(browser: Browser, tmp_path: P
 
 
 def touch(session: CDPSession, kind: str, *points: tuple[float, float]) -> None:
-    """As fingers do it: nothing of the page's script is called directly."""
+    """Real touch events: the page's script is not called directly."""
     given: list[Any] = [{'x': x, 'y': y, 'id': number} for number, (x, y) in enumerate(points)]
     session.send('Input.dispatchTouchEvent', {'type': kind, 'touchPoints': given})
 
@@ -99,7 +99,7 @@ def touch(session: CDPSession, kind: str, *points: tuple[float, float]) -> None:
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_on_a_phone_the_important_parts_come_first(browser: Browser, robot: Served) -> None:
-    """The button for this moment, the state and the camera are in view first; a tap on a figure shows its definition.
+    """The save button, the state and the camera are in view first; a tap on a value shows its definition.
 
     One finger on the 3D view scrolls the page; two turn the view and do not scroll. The page can be installed.
     """
@@ -145,7 +145,7 @@ def test_on_a_phone_the_important_parts_come_first(browser: Browser, robot: Serv
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_an_unfinished_check_is_not_an_error(browser: Browser, robot: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The doctor found nothing then, neither good nor bad; its errors are marked as such."""
+    """Then the doctor found neither problems nor their absence; its errors are marked as such."""
     found = [
         {'check': 's3.deadline', 'severity': 'error', 'seen': 'the check did not end within 20 s', 'cause': '', 'remedy': ''},
         {'check': 'disk.space', 'severity': 'error', 'seen': 'the disk is full', 'cause': '', 'remedy': 'free some'},
@@ -168,7 +168,7 @@ def test_an_unfinished_check_is_not_an_error(browser: Browser, robot: Served, mo
 @pytest.mark.long('a Chromium, a robot and a node')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Names, reasons and answers that are code or have no space in them: nothing of them runs, and a phone shows them."""
+    """Names, reasons and responses with code or without spaces: none of it runs, and it fits on a phone."""
     settings = LiveSettings(spool=tmp_path / 'spool', robot=LONG[:60], tokens=tmp_path / 'live', port=0)
     served = Served(settings, monkeypatch)
     try:
@@ -201,13 +201,13 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
 @pytest.mark.long('a Chromium, a robot and a node')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_waiting_uploads_name_their_rule_and_duration(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the node's status has it: the rule and why it does not hold, or when all of it will have arrived."""
+    """As in the node's status: the rule and why it does not hold, or when everything will have arrived."""
     spool, clock = tmp_path / 'spool', SystemClock.of_this_machine()
     served = Served(LiveSettings(spool=spool, robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
     said: dict[str, Any] = {'state': 'waiting', 'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}}
 
     def shows() -> list[str]:
-        """What the page says, of a node that goes on."""
+        """The text of the page, for a running node."""
         written(spool, boot_id=clock.boot_id, boot_ns=clock.boot_ns(), spool={'pending': 7}, store=said)
         texts: list[str] = page.locator('[data-field=waits-for], [data-field=left]').all_inner_texts()
         return texts

@@ -28,7 +28,7 @@ ARRIVAL_NS = STAMP_NS + 10**9
 
 
 class Outcome:
-    """What the pool handed on: it stands for the spool's writer, its spool and the accounts. Thread-safe enough."""
+    """Collects the results of the pool in place of the spool's writer, its spool and the accounts. Sufficiently thread-safe."""
 
     def __init__(self, threads: int = 2, observe: Callable[[Batch, DataObject | None], None] = lambda *_: None) -> None:
         self.queue = BatchQueue(QueueSettings())
@@ -73,7 +73,7 @@ def talk(*cdrs: bytes, sensor: str = 'talk') -> Batch:
 
 
 def test_valid_samples_are_stored_and_invalid_ones_rejected() -> None:
-    """The good ones of a batch are in its object, the bad ones are counted by reason."""
+    """The valid samples of a batch are in its object, the invalid ones are counted by reason."""
     outcome = Outcome()
     outcome.pool.open()
     outcome.queue.put(talk(TEXT, b'bad', TEXT), 5)
@@ -84,7 +84,7 @@ def test_valid_samples_are_stored_and_invalid_ones_rejected() -> None:
 
 
 def test_an_encoder_error_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    """The first rejected message of a topic and reason is told to the operator in words, the others are only counted."""
+    """The first rejected message of a topic and reason is logged with an explanation, the others are only counted."""
     outcome = Outcome(threads=1)
     outcome.queue.put(talk(b'bad', b'bad'), 5)
     outcome.queue.put(talk(b'bad'), 5)
@@ -96,7 +96,7 @@ def test_an_encoder_error_is_logged_once(caplog: pytest.LogCaptureFixture) -> No
 
 
 def test_corrected_messages_are_stored_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What had to be corrected is counted once its object is on its way, among the stored messages."""
+    """Corrections are counted once the object is put, among the stored messages."""
 
     def correcting(batch: Batch, *rest: Any) -> Encoding:
         made = encode(batch, *rest)
@@ -112,7 +112,7 @@ def test_corrected_messages_are_stored_and_counted(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_failing_observer_costs_nothing() -> None:
-    """Each batch is shown to it after its object is on its way; what it raises is counted as the thread's failure."""
+    """It receives each batch after the object is put; an exception is counted as a failure of the thread."""
     seen = []
 
     def observe(batch: Batch, item: DataObject | None) -> None:
@@ -131,7 +131,7 @@ def test_a_failing_observer_costs_nothing() -> None:
 
 
 def test_close_encodes_what_is_queued() -> None:
-    """Nothing that was queued before the close is lost, and closing again is allowed."""
+    """Nothing queued before the close is lost, and closing again is allowed."""
     outcome = Outcome(threads=1)
     for _ in range(200):
         outcome.queue.put(talk(TEXT), 5)
@@ -142,7 +142,7 @@ def test_close_encodes_what_is_queued() -> None:
 
 
 def test_a_bug_in_an_encoder_costs_its_batch_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its samples are rejected as encoder_failed, the failure is counted, and the others are encoded all the same."""
+    """Its samples are rejected as encoder_failed, the failure is counted, and the others are encoded anyway."""
     outcome, encode = Outcome(threads=1), pool_module.encode
 
     def faulty(batch: Batch, *rest: object) -> object:
@@ -165,7 +165,7 @@ def test_a_bug_in_an_encoder_costs_its_batch_only(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize('death', [SystemExit(1), MemoryError('no room'), KeyboardInterrupt()])
 @pytest.mark.parametrize('place', ['encode', 'put'])
 def test_a_failed_thread_is_restarted(monkeypatch: pytest.MonkeyPatch, death: BaseException, place: str) -> None:
-    """Whatever ends the encoder or the hand-over, its samples are rejected, the next batch is encoded by the same pool."""
+    """Whether encoding or the put fails, the samples are rejected, and the same pool encodes the next batch."""
     outcome, deaths = Outcome(threads=1), [death]
     real = {'encode': pool_module.encode, 'put': outcome.put}[place]
 
@@ -186,7 +186,7 @@ def test_a_failed_thread_is_restarted(monkeypatch: pytest.MonkeyPatch, death: Ba
 
 
 def test_a_slow_close_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A writer that blocks is not waited for longer than told."""
+    """A blocked writer is waited for only until the timeout."""
     outcome, entered, blocked = Outcome(threads=1), threading.Event(), threading.Event()
 
     def put(_: DataObject) -> None:
@@ -218,7 +218,7 @@ def taken(queue: BatchQueue) -> list[str]:
 
 
 def test_the_queue_gives_the_most_important_then_the_oldest() -> None:
-    """Priority 0 goes before 9; within one the order is that of arrival."""
+    """Priority 0 precedes 9; within a priority batches keep the order of arrival."""
     queue = BatchQueue(QueueSettings())
     for name, priority in (('c1', 6), ('a1', 1), ('c2', 6), ('a2', 1), ('b', 3)):
         assert queue.put(batch(name), priority) == []
@@ -226,7 +226,7 @@ def test_the_queue_gives_the_most_important_then_the_oldest() -> None:
 
 
 def test_too_many_bytes_drop_the_least_important_oldest_first() -> None:
-    """What has to go is told to the caller, who counts it."""
+    """Dropped batches are returned to the caller, which counts them."""
     queue = BatchQueue(QueueSettings(max_bytes=MEBI))
     for name, priority in (('lidar1', 7), ('lidar2', 7), ('imu', 4)):
         queue.put(batch(name, MEBI // 4), priority)
@@ -236,7 +236,7 @@ def test_too_many_bytes_drop_the_least_important_oldest_first() -> None:
 
 
 def test_too_many_messages_are_dropped_as_well() -> None:
-    """A batch counts with all of its messages."""
+    """A batch counts all of its messages."""
     queue = BatchQueue(QueueSettings(), max_messages=10)
     queue.put(batch('old', messages=6), 5)
     assert names(queue.put(batch('new', messages=6), 5)) == ['old']
@@ -244,7 +244,7 @@ def test_too_many_messages_are_dropped_as_well() -> None:
 
 
 def test_the_new_batch_may_be_the_one_that_is_dropped() -> None:
-    """A full queue of more important things keeps them; a batch larger than all of it is dropped at once."""
+    """A queue full of more important batches keeps them; a batch larger than the queue is dropped immediately."""
     queue = BatchQueue(QueueSettings(max_bytes=MEBI))
     queue.put(batch('imu', MEBI), 4)
     assert names(queue.put(batch('lidar', 1), 7)) == ['lidar']
@@ -253,7 +253,7 @@ def test_the_new_batch_may_be_the_one_that_is_dropped() -> None:
 
 
 def test_get_waits_for_a_batch() -> None:
-    """An encoder that waits gets what comes, at once."""
+    """A waiting encoder gets the next batch immediately."""
     queue, got = BatchQueue(QueueSettings()), []
     thread = threading.Thread(target=lambda: got.append(queue.get(30.0)))
     thread.start()
@@ -264,7 +264,7 @@ def test_get_waits_for_a_batch() -> None:
 
 
 def test_a_closed_queue_is_emptied_and_does_not_wait() -> None:
-    """Closing wakes those who wait; what is inside can still be taken."""
+    """Closing wakes all waiting threads; queued batches can still be taken."""
     queue = BatchQueue(QueueSettings())
     threads = [threading.Thread(target=queue.get, args=(30.0,)) for _ in range(2)]
     for thread in threads:
@@ -280,7 +280,7 @@ def test_a_closed_queue_is_emptied_and_does_not_wait() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, MEBI), st.integers(1, 40))))
 def test_the_queue_keeps_its_bounds_and_loses_nothing_silently(arrivals: list[tuple[int, int, int]]) -> None:
-    """Every batch is inside, dropped or taken, and a dropped one was never more important than one that stays."""
+    """Every batch is queued, dropped or taken, and a dropped one was never more important than one that was kept."""
     queue = BatchQueue(QueueSettings(max_bytes=MEBI), max_messages=100)
     inside: dict[str, int] = {}
     for number, (priority, size, messages) in enumerate(arrivals):
@@ -296,7 +296,7 @@ def test_the_queue_keeps_its_bounds_and_loses_nothing_silently(arrivals: list[tu
 
 
 def test_a_caller_can_wait_for_the_current_batches() -> None:
-    """All batches that were put before the call must have left, done or dropped; those that come later do not count."""
+    """It waits until all batches put before the call are encoded or dropped; later ones do not count."""
     queue = BatchQueue(QueueSettings(), max_messages=2)
     assert queue.finished(0.0), 'an empty queue has nothing to wait for'
     queue.put(batch('lidar'), 7)
@@ -304,7 +304,7 @@ def test_a_caller_can_wait_for_the_current_batches() -> None:
     imu = queue.get(0.0)
     assert imu
     assert not queue.finished(0.0)
-    queue.put(batch('odom', messages=2), 3)  # drops the lidar's
+    queue.put(batch('odom', messages=2), 3)  # drops the batch of the lidar
     odom = queue.get(0.0)
     assert odom
     queue.done(odom)
@@ -314,7 +314,7 @@ def test_a_caller_can_wait_for_the_current_batches() -> None:
 
 
 def test_waiting_ends_with_the_last_batch() -> None:
-    """Whoever waits goes on when the last batch of before is done, though important ones keep coming."""
+    """The wait ends when the last of these batches is done, even if important ones keep arriving."""
     queue = BatchQueue(QueueSettings())
     queue.put(batch('lidar'), 7)
     waited: list[bool] = []

@@ -1,4 +1,4 @@
-"""Where the robot was at an object's time, held against the simulator's patrol, which knows it exactly."""
+"""The robot's position at an object's time, compared with the simulator's exact patrol."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def robot(settings: MissionSettings = SETTINGS) -> RobotTrack:
 
 
 def walking(poses: Sequence[tuple[float, bytes]]) -> RobotTrack:
-    """A robot whose odometry came at these seconds."""
+    """A track with odometry received at these seconds."""
     found = robot()
     take(found, '/odom', ODOMETRY, *poses)
     return found
 
 
 def take(found: RobotTrack, topic: str, type_name: str, *sent: tuple[float, bytes]) -> None:
-    """Messages as the intake hands them over."""
+    """Messages as the intake passes them on."""
     messages = [Taken(cdr, ns(t), 'p', None, ns(t), ns(t)) for t, cdr in sent]
     found.take(Drained(topic, type_name, topic[1:], messages, None, 0.0, paused=False))
 
@@ -74,7 +74,7 @@ def ns(t: float) -> int:
 
 
 def marked(found: RobotTrack, start: float, end: float | None = None) -> dict[str, str]:
-    """What an object of this time, in seconds, is marked with."""
+    """The pose recorded with an object of this time in seconds."""
     item = DataObject(bucket='b', key='k', body=b'', content_type='', sensor='s', topic=None, type='', samples=1,
                       t_start_ns=ns(start), t_end_ns=ns(start if end is None else end))  # fmt: skip
     return dict(found.mark(item).metadata)
@@ -87,7 +87,7 @@ def pose(found: RobotTrack, start: float, end: float | None = None) -> tuple[flo
 
 @pytest.mark.parametrize(('rate_hz', 'bar_m', 'bar_rad'), [(50.0, 0.005, 0.04), (10.0, 0.005, 0.04), (5.0, 0.01, 0.2)])
 def test_poses_are_exact_throughout_a_patrol(rate_hz: float, bar_m: float, bar_rad: float) -> None:
-    """All the way round every corner, at any time between two messages, they are the simulator's; the bar is 10 cm."""
+    """Around every corner, at any time between two messages, they match the simulator's within 10 cm."""
     patrol = Patrol.through(FloorPlan.build().patrol)
     count = round(50 * rate_hz)
     truths = [(number / rate_hz, patrol.at(number / rate_hz)) for number in range(count)]
@@ -103,7 +103,7 @@ def test_poses_are_exact_throughout_a_patrol(rate_hz: float, bar_m: float, bar_r
 
 
 def test_the_odometry_may_come_a_little_late() -> None:
-    """A quarter of a second after the newest message the robot is where it went, within 10 cm in any bend; later nobody knows."""
+    """Up to 250 ms after the newest message the pose is within 10 cm in any turn; after that it is unknown."""
     patrol = Patrol.through(FloorPlan.build().patrol)
     for end in np.arange(1.0, 40.0, 0.21).tolist():
         times = np.arange(end - 0.5, end + 1e-9, 0.02).tolist()
@@ -116,7 +116,7 @@ def test_the_odometry_may_come_a_little_late() -> None:
 
 @pytest.mark.long('a second of CPU or more')
 def test_poses_are_exact_when_the_node_starts_during_a_turn() -> None:
-    """What came before the odometry that was heard first has no pose, but for an instant, in which no robot turns by much."""
+    """Before the first odometry received there is no pose, except for a moment in which no robot turns much."""
     patrol = Patrol.through(FloorPlan.build().patrol)
     known = 0
     for start in np.arange(1.0, 40.0, 0.03).tolist():
@@ -129,13 +129,13 @@ def test_poses_are_exact_when_the_node_starts_during_a_turn() -> None:
 
 
 def test_a_batch_has_the_pose_of_its_middle() -> None:
-    """Start and end do not matter."""
+    """Its start and end do not matter."""
     found = walking([(t, odometry(t, 0.0, 0.0)) for t in range(11)])
     assert pose(found, 2.0, 8.0) == (5.0, 0.0, 0.0)
 
 
 def test_yaw_is_interpolated_the_shorter_way() -> None:
-    """From 179 to -179 degrees by way of 180; no text is a minus zero."""
+    """From 179 to -179 degrees through 180; the text never contains a negative zero."""
     found = walking([(0.0, odometry(0, -1e-9, math.radians(179))), (0.1, odometry(0, 0, math.radians(-177)))])
     at = pose(found, 0.05)
     assert at is not None
@@ -151,13 +151,13 @@ def test_yaw_is_interpolated_the_shorter_way() -> None:
     ],
 )  # fmt: skip
 def test_an_unknown_pose_is_not_invented(times: list[float], asked: float, known: bool) -> None:
-    """Before the first message, in a gap and after the last there is no pose; a lone message holds for an instant."""
+    """Before the first message, in a gap and after the last there is no pose; a single message is valid for a moment."""
     assert (pose(walking([(t, odometry(1, 1, 0)) for t in times]), asked) is not None) is known
 
 
 @pytest.mark.long('a minute of poses')
 def test_the_track_is_a_minute_long() -> None:
-    """What is older is forgotten, so that it does not grow; of fast odometry some messages are kept, of each second."""
+    """Older messages are removed, so that it stays bounded; of fast odometry a few messages per second are kept."""
     found = walking([(number / 200, odometry(number / 200, 0.0, 0.0)) for number in range(200 * 200)])
     ((_, track),) = found._poses
     assert len(track._kept) == len(track._stamps) < 1500
@@ -166,7 +166,7 @@ def test_the_track_is_a_minute_long() -> None:
 
 
 def test_a_clock_step_starts_a_new_track() -> None:
-    """After a step back poses are those of after it; a message that is a little late changes nothing."""
+    """After a step back, poses use only the messages after it; a message that is slightly late changes nothing."""
     found = walking([(100.0, odometry(1, 0, 0)), (101.0, odometry(1, 0, 0)), (50.0, odometry(5, 0, 0)),
                      (51.0, odometry(5, 0, 0)), (50.5, odometry(9, 0, 0))])  # fmt: skip
     assert pose(found, 50.5) == (5.0, 0.0, 0.0)
@@ -175,12 +175,12 @@ def test_a_clock_step_starts_a_new_track() -> None:
 
 @pytest.mark.parametrize('cdr', [b'', b'\x00\x01\x00\x00', odometry(math.nan, 0, 0), odometry(0, 0, 0)[:60]])
 def test_unreadable_odometry_is_skipped(cdr: bytes) -> None:
-    """It spoils no object."""
+    """Objects are not affected."""
     assert pose(walking([(0.0, cdr), (0.1, cdr)]), 0.05) is None
 
 
 def test_a_frame_id_is_one_word() -> None:
-    """Whatever the odometry says, the pose has four words of ASCII; between two frames there is none."""
+    """Whatever the odometry contains, the pose is four words of ASCII; between two frames there is none."""
     said = marked(walking([(t, odometry(1, 2, 0, 'my odöm\n')) for t in (0.0, 0.1)]), 0.05)['pose']
     assert said == '1.000 2.000 0.0000 my_od_m_'
     found = walking([(0.0, odometry(1, 2, 0, 'odom')), (0.2, odometry(9, 9, 0, 'map'))])
@@ -188,7 +188,7 @@ def test_a_frame_id_is_one_word() -> None:
 
 
 def test_the_battery_is_the_nearest_one_known() -> None:
-    """For half a minute, before as well as after."""
+    """Within half a minute, before or after."""
     found = robot()
     track = found.of('/charge', CHARGE)
     assert track is not None
@@ -199,7 +199,7 @@ def test_the_battery_is_the_nearest_one_known() -> None:
 
 
 def test_any_battery_state_is_one_by_default() -> None:
-    """Whatever its topic; one of a preferred topic counts before it."""
+    """On any topic; a preferred topic takes precedence."""
     found = robot(MissionSettings())
     take(found, '/power/main', BATTERY_STATE, (0.0, battery_state(0.25)))
     assert marked(found, 0.0)['battery_pct'] == '25'
@@ -208,7 +208,7 @@ def test_any_battery_state_is_one_by_default() -> None:
 
 
 def test_any_odometry_is_one_by_default() -> None:
-    """Whatever its topic; ``odom`` counts before it."""
+    """On any topic; ``odom`` takes precedence."""
     found = robot(MissionSettings())
     take(found, '/wheels/odometry', ODOMETRY, (0.0, odometry(1, 2, 0)))
     assert pose(found, 0.0) == (1.0, 2.0, 0.0)
@@ -231,14 +231,14 @@ def fix(latitude: float, longitude: float, altitude: float = 500.0, status: int 
     ],
 )  # fmt: skip
 def test_the_position_on_earth_is_that_of_the_nearest_fixes(t: float, gps: str | None) -> None:
-    """That of the fixes around it, or of one at most two seconds away."""
+    """Interpolated between the fixes around it, or a single one at most two seconds away."""
     found = robot()
     take(found, '/fix', FIX, (0.0, fix(10.0, 20.0)), (1.0, fix(10.0001, 20.0001, status=-2)))
     assert marked(found, t).get('gps') == gps
 
 
 def test_positions_are_interpolated_across_the_antimeridian() -> None:
-    """Between 179.9999 and -179.9999 lies 180."""
+    """180 is between 179.9999 and -179.9999."""
     found = robot()
     take(found, '/fix', FIX, (0.0, fix(0.0, 179.9999)), (1.0, fix(0.0, -179.9999)))
     assert marked(found, 0.5)['gps'] == '0.0000000 -180.0000000 500.00'
@@ -246,7 +246,7 @@ def test_positions_are_interpolated_across_the_antimeridian() -> None:
 
 @pytest.mark.parametrize('cdr', [b'', fix(1.0, 1.0, status=-1), fix(math.nan, math.nan), fix(95.0, 0.0), fix(0.0, 200.0)])
 def test_without_a_fix_there_is_no_position(cdr: bytes) -> None:
-    """Without a fix, and for what is no place on Earth."""
+    """Without a fix, and for coordinates that are not on Earth."""
     found = robot()
     take(found, '/fix', FIX, (0.0, cdr))
     assert 'gps' not in marked(found, 0.0)
@@ -257,21 +257,21 @@ def test_without_a_fix_there_is_no_position(cdr: bytes) -> None:
     [(0.73, '73'), (0.0, '0'), (1.0, '100'), (math.nan, None), (-1.0, None), (73.0, None)],
 )
 def test_the_charge_of_a_battery_state_is_in_percent(published: float, known: str | None) -> None:
-    """``BatteryState.percentage`` is 0 to 1 by its definition, and NaN where it is not measured; what is beyond is unknown."""
+    """``BatteryState.percentage`` is defined as 0 to 1, and NaN if it is not measured; a value outside is unknown."""
     found = robot(MissionSettings(battery='battery:percentage'))
     take(found, '/battery', BATTERY_STATE, (0.0, battery_state(published)))
     assert marked(found, 0.0).get('battery_pct') == known
 
 
 def test_other_fields_of_a_battery_state_are_unchanged() -> None:
-    """Volts are volts."""
+    """Volts stay volts."""
     found = robot(MissionSettings(battery='battery:voltage'))
     take(found, '/battery', BATTERY_STATE, (0.0, battery_state(0.5)))
     assert marked(found, 0.0)['battery_pct'] == '28.5'
 
 
 def test_only_requested_topics_are_kept() -> None:
-    """Of other topics, of odometry that is none and with empty settings there is no track, and objects stay as they are."""
+    """Other topics, invalid odometry and empty settings create no track, and objects are unchanged."""
     found = robot()
     assert found.of('/odom', CHARGE) is None
     assert found.of('/imu', 'sensor_msgs/msg/Imu') is None
@@ -281,7 +281,7 @@ def test_only_requested_topics_are_kept() -> None:
 
 
 def test_encoders_ask_while_the_intake_adds() -> None:
-    """Whatever they see is a pose of the straight line that the robot walks."""
+    """Every pose they get is on the straight line of the robot's motion."""
     found = robot()
     track: Any = found.of('/odom', ODOMETRY)
     told: list[tuple[float, tuple[float, float, float]]] = []

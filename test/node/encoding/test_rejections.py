@@ -42,7 +42,7 @@ def minute() -> Minute:
 
 
 def test_the_first_rejection_is_logged_immediately_others_each_minute(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
-    """A driver whose messages are all rejected costs a line a minute, with the number of messages since the last."""
+    """A driver with only rejected messages logs one line per minute, with the number of messages since the last one."""
     for _ in range(180):
         minute.reject(10)
         minute.wait(1.0)
@@ -54,7 +54,7 @@ def test_the_first_rejection_is_logged_immediately_others_each_minute(minute: Mi
 
 
 def test_rejections_after_the_last_report_are_reported(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
-    """It is reported when its minute is over, though no more messages come; then there is silence."""
+    """They are reported at the end of their minute, even if no more arrive; then nothing is logged."""
     minute.reject()
     minute.reject()
     minute.wait(PERIOD_S - 1.0)
@@ -67,7 +67,7 @@ def test_rejections_after_the_last_report_are_reported(minute: Minute, caplog: p
 
 
 def test_rejections_are_logged_by_topic_reason_and_node(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
-    """Each pair has its own minute; two publishers of one node are one, and a node is looked up once."""
+    """Each pair has a separate minute; two publishers of one node count as one, and a node is looked up once."""
     for publisher in ('gid1', 'gid2', 'gid3', 'gone', '', 'gid1'):
         minute.reject(publisher=publisher)
     minute.reject(reason='size_mismatch', publisher='gid1')
@@ -79,7 +79,7 @@ def test_rejections_are_logged_by_topic_reason_and_node(minute: Minute, caplog: 
 
 
 def test_every_report_has_a_remedy(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
-    """That of the reason, that of the rejection, or one that always helps, with the names that the operator needs."""
+    """The remedy of the reason, of the rejection, or a general one, with the names that the operator needs."""
     minute.reject(reason='unknown_type')
     minute.reject(reason='something_new')
     minute.log.add('/odom', '', [Rejection('wrong_type', '', 'wrong_type: it is a String', 1, 'stop it')])
@@ -89,7 +89,7 @@ def test_every_report_has_a_remedy(minute: Minute, caplog: pytest.LogCaptureFixt
 
 
 def test_known_rejections_wait_for_the_next_report(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
-    """What somebody else reported is not reported again before a minute is over."""
+    """A rejection reported elsewhere is not reported again within a minute."""
     minute.log.add('/odom', '', [Rejection('wrong_type', '', 'wrong_type: it is a String', 5)], is_known=True)
     assert not caplog.records
     minute.wait(PERIOD_S)
@@ -97,7 +97,7 @@ def test_known_rejections_wait_for_the_next_report(minute: Minute, caplog: pytes
 
 
 def test_an_unbounded_number_of_names_is_summarized(minute: Minute, caplog: pytest.LogCaptureFixture) -> None:
-    """Whoever invents topics and publishers costs no more memory than a thousand of them."""
+    """Arbitrarily many invented topics and publishers use no more memory than a thousand."""
     caplog.set_level(logging.CRITICAL)
     for number in range(3 * MAX_KNOWN):
         minute.reject(topic=f'/t{number}', publisher=f'gid{number}')
@@ -112,7 +112,7 @@ def opened() -> Iterator[ExitStack]:
 
 @pytest.mark.ros
 def test_the_node_is_that_of_the_publisher(domain: int, opened: ExitStack, caplog: pytest.LogCaptureFixture) -> None:
-    """Of two nodes that publish a topic, over real DDS, the one whose messages are rejected is named."""
+    """Of two nodes that publish a topic over real DDS, the one with rejected messages is named."""
     pytest.importorskip('rclpy')
     from node.participants import Participant
     from std_msgs.msg import String

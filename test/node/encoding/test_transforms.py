@@ -1,4 +1,4 @@
-"""Where tf has the robot at an object's time, against the motion that was published."""
+"""The robot's position from tf at an object's time, compared with the published motion."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def tf(*frames: Frame) -> bytes:
 
 
 class Robot:
-    """A track to which transforms are published."""
+    """A track that receives transforms."""
 
     def __init__(self, name: str = '') -> None:
         self.track = RobotTrack(MissionSettings(), TYPES, lambda topic: f'/{topic}', name)
@@ -70,7 +70,7 @@ class Robot:
 
 
 def walking(robot: Robot, seconds: float = 2.0) -> Robot:
-    """Along x at 1 m/s, with odometry at 20 Hz; the map is turned by a right angle, and shifted."""
+    """Along x at 1 m/s, with odometry at 20 Hz; the map is rotated by 90 degrees and shifted."""
     for number in range(round(seconds * 20) + 1):
         t = number / 20
         robot.send(t, Frame('odom', 'base_footprint', t))
@@ -81,12 +81,12 @@ def walking(robot: Robot, seconds: float = 2.0) -> Robot:
 
 
 def test_a_pose_is_in_the_map() -> None:
-    """Odometry and localization are joined: 1.5 m ahead in odometry is 1.5 m to the left of the origin of the map."""
+    """Odometry and localization are combined: 1.5 m ahead in odometry is 1.5 m to the left of the origin of the map."""
     assert walking(Robot()).pose(1.5) == (10.0, 21.5, round(math.pi / 2, 4), 'map')
 
 
 def test_poses_are_interpolated_between_transforms() -> None:
-    """It is interpolated, and extrapolated for a moment; then it is unknown."""
+    """It is interpolated, and extrapolated briefly; after that it is unknown."""
     robot = walking(Robot())
     assert robot.pose(1.026) == (10.0, 21.026, 1.5708, 'map')
     assert robot.pose(2.2) == (10.0, 22.2, 1.5708, 'map')
@@ -95,7 +95,7 @@ def test_poses_are_interpolated_between_transforms() -> None:
 
 
 def test_the_map_takes_precedence_over_odometry() -> None:
-    """And odometry before tf without a map."""
+    """And odometry over tf without a map."""
     robot = walking(Robot())
     robot.take('/odom', ODOMETRY, 1.0, odometry(7.0, 7.0, 0.0))
     assert robot.pose(1.0) == (10.0, 21.0, 1.5708, 'map')
@@ -107,7 +107,7 @@ def test_the_map_takes_precedence_over_odometry() -> None:
 
 
 def test_an_outdated_map_is_not_used() -> None:
-    """Where localization stopped, the pose is that of odometry again: in its own frame."""
+    """After localization stopped, the pose is that of odometry again, in its frame."""
     robot = walking(Robot(), 1.0)
     for number in range(21, 200):
         robot.send(number / 20, Frame('odom', 'base_footprint', number / 20))
@@ -116,7 +116,7 @@ def test_an_outdated_map_is_not_used() -> None:
 
 
 def test_robots_in_one_tree_are_kept_apart() -> None:
-    """Each has its own frames, by the name of its namespace."""
+    """Each has separate frames, identified by its namespace."""
     for name, x in (('robot0', 1.0), ('robot1', 2.0)):
         robot = Robot(name)
         for other, at in (('robot0', 1.0), ('robot1', 2.0)):
@@ -126,7 +126,7 @@ def test_robots_in_one_tree_are_kept_apart() -> None:
 
 
 def test_transforms_sent_one_by_one_are_all_kept() -> None:
-    """A publisher that sends each transform in a message of its own: none of them is lost among those that are kept."""
+    """A publisher may send each transform in a separate message: none of those kept is lost."""
     robot = Robot()
     for number in range(100):
         t = number / 100
@@ -143,7 +143,7 @@ def test_transforms_sent_one_by_one_are_all_kept() -> None:
     ],
 )  # fmt: skip
 def test_frames_without_a_transform_have_no_pose(frames: tuple[Frame, ...]) -> None:
-    """Trees without a map and odometry, trees that are none, and numbers that are none."""
+    """Trees without a map and odometry, invalid trees, and invalid numbers."""
     robot = Robot()
     robot.send(0.0, *frames)
     assert robot.pose(0.0) is None
@@ -151,14 +151,14 @@ def test_frames_without_a_transform_have_no_pose(frames: tuple[Frame, ...]) -> N
 
 @pytest.mark.parametrize('cdr', [b'', b'\0\1\0\0', b'\0\1\0\0' + b'\xff' * 40, tf(Frame('odom', 'base_link'))[:50], b'\0\7' * 30])
 def test_hostile_transforms_are_ignored(cdr: bytes) -> None:
-    """They are no transforms, and those of others are found."""
+    """Invalid transforms are ignored, and those of others are found."""
     robot = walking(Robot())
     robot.take('/tf', TRANSFORMS, 1.0, cdr)
     assert robot.pose(1.5) == (10.0, 21.5, 1.5708, 'map')
 
 
 def test_the_number_of_frames_is_bounded() -> None:
-    """Whoever invents how many; those that are still sent stay, and what came long ago makes room."""
+    """However many a publisher invents; frames still being sent are kept, and old ones are replaced."""
     track = transforms.TransformTrack(TYPES, '')
     for number in range(2 * transforms.MAX_KEPT):
         stamp_ns = START_NS + number * SECOND

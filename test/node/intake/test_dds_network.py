@@ -1,4 +1,4 @@
-"""Where a robot with Cyclone DDS finds its publishers, from its variables, and the profile that looks there too."""
+"""Where a robot with Cyclone DDS finds its publishers, from its variables, and the equivalent Fast DDS profile."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def network(*, has_range: bool = True, **environ: str) -> Network:
 
 
 def test_by_default_all_interfaces_and_multicast_are_used() -> None:
-    """Then Fast DDS finds everybody by its own means."""
+    """Then Fast DDS discovers all publishers with its defaults."""
     found = network()
     assert found == Network()
     assert announced_to(found, 5) == []
 
 
 def test_localhost_only_is_the_loopback_interface_on_humble() -> None:
-    """Where everybody is told by unicast as well: Cyclone DDS 0.10 has no multicast there, and 11 has."""
+    """Discovery data is also sent by unicast to each address: Cyclone DDS 0.10 has no multicast there, and 11 has."""
     found = network(has_range=False, ROS_LOCALHOST_ONLY='1', ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET')
     assert (found.interfaces, found.multicast) == (('127.0.0.1',), True)
     assert announced_to(found, 5) == [('239.255.0.1', 8650), *(('127.0.0.1', port) for port in LOCAL)]
@@ -49,7 +49,7 @@ def test_localhost_only_is_the_loopback_interface_on_humble() -> None:
 
 @pytest.mark.parametrize('environ', [{'ROS_LOCALHOST_ONLY': '1'}, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}])
 def test_localhost_uses_no_multicast_after_humble(environ: dict[str, str]) -> None:
-    """All addresses of this machine are told, and where the range asks for peers those too."""
+    """All addresses of this machine are peers, and the static peers if the range includes them."""
     found = network(**environ, ROS_STATIC_PEERS='10.0.0.9:7777')
     assert (found.interfaces, found.multicast) == ((), False)
     expected = [(address, port) for _, address in HERE for port in LOCAL]
@@ -57,7 +57,7 @@ def test_localhost_uses_no_multicast_after_humble(environ: dict[str, str]) -> No
 
 
 def test_every_discovery_range_is_translated() -> None:
-    """OFF finds nobody; SYSTEM_DEFAULT knows no static peers, SUBNET has them beside multicast."""
+    """OFF finds no publisher; SYSTEM_DEFAULT has no static peers, SUBNET has them in addition to multicast."""
     assert network(ROS_AUTOMATIC_DISCOVERY_RANGE='OFF').is_off
     assert network(ROS_AUTOMATIC_DISCOVERY_RANGE='SYSTEM_DEFAULT', ROS_STATIC_PEERS='10.0.0.9') == Network()
     found = network(ROS_STATIC_PEERS='10.0.0.9; 10.0.0.8')
@@ -81,12 +81,12 @@ def test_every_discovery_range_is_translated() -> None:
     ],
 )
 def test_interfaces_of_cyclone_dds_are_used(uri: str, interfaces: tuple[str, ...]) -> None:
-    """By name or address, in the old and the new words, of the domain that is ours."""
+    """By name or address, in the old and the new syntax, for our domain."""
     assert network(CYCLONEDDS_URI=uri).interfaces == interfaces
 
 
 def test_a_missing_interface_is_reported() -> None:
-    """It is a problem that has a name: a white list of nothing would hear nobody."""
+    """It is reported by name: with an empty white list nothing would be received."""
     found = network(CYCLONEDDS_URI=general('<Interfaces><NetworkInterface name="eth7"/></Interfaces>'))
     assert found.interfaces == ()
     assert 'eth7' in found.problem
@@ -103,7 +103,7 @@ def test_peers_of_cyclone_dds_are_used(tmp_path: Path) -> None:
     told = announced_to(found, 5)
     assert ('127.0.0.1', 7411) in told
     assert ('10.0.0.9', 7400 + 250 * 5 + 10 + 80) in told
-    assert ('10.0.0.2', 8660) in told, 'who is on this machine is told as well'
+    assert ('10.0.0.2', 8660) in told, 'peers on this machine are notified as well'
     assert network(CYCLONEDDS_URI=f'file://{tmp_path}/none.xml') == Network()
 
 
@@ -111,7 +111,7 @@ def test_peers_of_cyclone_dds_are_used(tmp_path: Path) -> None:
     ('words', 'multicast'), [('true', True), ('spdp', True), ('asm, spdp', True), ('false', False), ('default', True)]
 )
 def test_multicast_settings_of_cyclone_dds_are_used(words: str, multicast: bool) -> None:
-    """Whether participants are found by it."""
+    """Whether participants are discovered by multicast."""
     assert network(CYCLONEDDS_URI=general(f'<AllowMulticast>{words}</AllowMulticast>')).multicast is multicast
 
 
@@ -125,12 +125,12 @@ def test_multicast_settings_of_cyclone_dds_are_used(words: str, multicast: bool)
     ],
 )  # fmt: skip
 def test_settings_that_fast_dds_lacks_are_reported(uri: str) -> None:
-    """Somebody who listens through Fast DDS would find others there, or nobody: it is told."""
+    """Discovery through Fast DDS would find different publishers, or none: this is reported."""
     assert 'CYCLONEDDS_URI' in network(CYCLONEDDS_URI=uri).problem
 
 
 def test_settings_without_effect_are_not_reported() -> None:
-    """The same elements with their defaults."""
+    """The same elements with their default values."""
     uri = discovery('<Tag></Tag><ExternalDomainId>default</ExternalDomainId>') + general('<Transport>default</Transport>')
     assert network(CYCLONEDDS_URI=uri) == Network()
 
@@ -143,7 +143,7 @@ def parsed(text: str) -> ET.Element:
 
 
 def test_the_profile_has_buffer_interfaces_and_peers() -> None:
-    """Buffer, interfaces and peers stand where Fast DDS reads them; shared memory only where it has a size."""
+    """Buffer, interfaces and peers are where Fast DDS reads them; shared memory only if it has a size."""
     root = parsed(profile(4 << 20, Network(interfaces=('10.0.0.2',), multicast=False), 5))
     assert [each.text for each in root.iter('type')] == ['UDPv4']
     assert [each.text for each in root.iter('receiveBufferSize')] == [str(4 << 20)]
@@ -160,7 +160,7 @@ def test_the_profile_has_buffer_interfaces_and_peers() -> None:
 
 
 def test_the_addresses_of_this_machine_can_be_bound() -> None:
-    """As the kernel has them: each can be bound."""
+    """As the kernel lists them: each can be bound."""
     found = addresses()
     assert ('lo', '127.0.0.1') in found
     for _, address in found:

@@ -1,4 +1,4 @@
-"""Subscriptions that exist before the intake does, over real DDS."""
+"""Subscriptions that exist before the intake, over real DDS."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STRING: Final = 'std_msgs/msg/String'
 
 
 class Start:
-    """A node that starts: its early readers, and later its intake."""
+    """A starting node: its early readers, and later its intake."""
 
     def __init__(self, domain: int, stack: ExitStack) -> None:
         self._stack = stack
@@ -80,11 +80,11 @@ def start() -> Iterator[Start]:
 
 @pytest.mark.parametrize('quality', QUALITIES)
 def test_messages_that_arrive_before_the_intake_exists_are_kept_once(start: Start, quality: str) -> None:
-    """All that was published after the match, in order, whatever the publisher's QoS, and what follows as well."""
+    """Everything published after the match, in order, with any QoS of the publisher, and the messages that follow as well."""
     reliable, latched = QUALITIES[quality]
     start.robot.create(String, '/a', reliable=reliable, latched=latched)
     early = EarlyReaders(start.logger.node, [start.sensor('a')])
-    matches = 2 if reliable else 1  # a RELIABLE publisher matches both of the pair
+    matches = 2 if reliable else 1  # a RELIABLE publisher matches both subscriptions
     until(lambda: start.robot.matched('/a') >= matches, 'the publisher is matched')
     pair = early._readers['/a', STRING]
     until(lambda: sum(reader.matched() for reader in pair) >= matches, 'its subscriptions are matched')
@@ -99,7 +99,7 @@ def test_messages_that_arrive_before_the_intake_exists_are_kept_once(start: Star
 
 
 def test_an_unneeded_early_subscription_ends(start: Start) -> None:
-    """It belongs to a sensor that is off now, or whose topic has another type than the settings named."""
+    """It belongs to a sensor that is now disabled, or a topic with a type other than in the settings."""
     a, b = start.sensor('a'), start.sensor('b')
     start.robot.create(Int32, '/a')
     early = EarlyReaders(start.logger.node, [a, b])
@@ -111,7 +111,7 @@ def test_an_unneeded_early_subscription_ends(start: Start) -> None:
 
 
 def test_topics_that_cannot_be_subscribed_to_early_are_left_to_the_intake(start: Start) -> None:
-    """A type that is not installed, several possible types, or none, raise nothing and make no subscription."""
+    """A type that is not installed, several possible types, or none: no exception and no subscription."""
     sensors = [
         start.sensor('a', ('no_such_package/msg/X',)),
         start.sensor('b', (f'{STRING}|std_msgs/msg/Int32',)),

@@ -1,4 +1,4 @@
-"""The number of topics for bags and events is limited, however many exist: over real DDS, with small limits."""
+"""The number of topics for bags and events is limited, however many exist: over real DDS, with low limits."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def robot(domain: int) -> Iterator[Node]:
 
 
 class Recording:
-    """What a bag of ``/crowd/...`` and the named topic ``/named`` listens to."""
+    """The topics of a bag of ``/crowd/...`` and of the named topic ``/named``."""
 
     def __init__(self, node: Node) -> None:
         choice = TopicChoice(BagSettings(regex='^/crowd/'), ['/named'])
@@ -93,7 +93,7 @@ def crowd(robot: Node, *names: str) -> list[Any]:
 def test_unconfigured_topics_are_limited(
     robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Beyond the bound a topic is left out, which is told once and counted; one that is named has its place whatever there is."""
+    """A topic above the limit is skipped, logged once and counted; a named topic always has a place."""
     monkeypatch.setattr(module, 'MAX_FOUND', 3)
     crowd(robot, *(f'/crowd/{letter}' for letter in 'abcde'))
     with caplog.at_level(logging.WARNING):
@@ -107,7 +107,7 @@ def test_unconfigured_topics_are_limited(
 
 
 def test_an_abandoned_topic_frees_its_place(robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A while after its publisher a subscription goes, and another topic is taken."""
+    """The subscription is removed some time after its publisher left, and another topic takes its place."""
     monkeypatch.setattr(module, 'MAX_FOUND', 1)
     (first,) = crowd(robot, '/crowd/a')
     recording.until(lambda found: found == {'/crowd/a'})
@@ -121,7 +121,7 @@ def test_an_abandoned_topic_frees_its_place(robot: Node, recording: Recording, m
 
 
 def test_topics_that_come_and_go_are_limited(robot: Node, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The middleware keeps a little of each name: who makes new ones for ever is not followed for ever."""
+    """The middleware keeps some memory for each name: new ones are followed only up to a limit."""
     monkeypatch.setattr(module, 'MAX_EVER', 2)
     for name in ('/crowd/a', '/crowd/b', '/crowd/c'):
         (publisher,) = crowd(robot, name)
@@ -147,7 +147,7 @@ def test_topics_that_come_and_go_are_limited(robot: Node, recording: Recording, 
 def test_topics_are_selected_by_name_and_pattern(
     named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]
 ) -> None:
-    """Those that are named, or match and are neither excluded nor hidden (unless the regex has /_); otherwise the sensors'."""
+    """Those that are named, or match and are neither excluded nor hidden (unless the regex has /_); by default the sensors'."""
     choice = TopicChoice(BagSettings(regex=regex, exclude=exclude), named)
     assert choice.needs_graph is bool(regex)
     assert choice.wanted(SENSORS, GRAPH) == set(wanted)
@@ -157,5 +157,5 @@ def test_topics_are_selected_by_name_and_pattern(
     'name', ['/%s%n', '/1digit', '//double', '/{curly}~', '/a b', '/a\x1b]0;owned\x07', '/ä', 'relative', '/a' * 150]
 )
 def test_names_that_are_invalid_in_ros_are_ignored(name: str) -> None:
-    """A program without ROS may have any; an expression that matches it takes the other topics."""
+    """A program without ROS may use any name; an expression that matches it still selects the other topics."""
     assert TopicChoice(BagSettings(regex='.*'), ()).wanted((), [name, '/good']) == {'/good'}

@@ -1,4 +1,4 @@
-"""Which namespaces are those of robots."""
+"""Which namespaces belong to robots."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ ROBOT = ('odom', 'imu', 'camera/image_raw')
     ],
 )
 def test_namespaces_of_robots_are_found(topics: list[str], own: str, robots: list[str]) -> None:
-    """Those with three topics or more that have the names of the default sensors; not those of parts of a robot."""
+    """Those with at least three topics named like those of default sensors; namespaces of a robot's parts are not included."""
     assert robots_in(topics, own) == robots

@@ -1,4 +1,4 @@
-"""Publishers of every kind, early and late, alone and together: everything sent after the match is taken once."""
+"""Publishers of every kind, early and late, alone and together: everything sent after the match is received once."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from shadowhound_data_logger.spool.gaps import EXACT
 
 @pytest.mark.parametrize('wall_s', [0.0, 1764003000.0, 1764003000.05, 1764003000.09, 1764003000.11, 1764003000.1999, 5.15])
 def test_polls_are_halfway_between_multiples_of_their_period(wall_s: float) -> None:
-    """Whenever a poll was, the next one is at the nearest such time that leaves a quarter of the period between them."""
+    """The next poll after any poll is at the nearest such time with at least a quarter of the period in between."""
     pause_s = until_poll(wall_s)
     assert POLL_S / 4 <= pause_s <= 1.25 * POLL_S
     assert (wall_s + pause_s) / POLL_S % 1 == pytest.approx(0.5, abs=1e-5)
@@ -45,7 +45,7 @@ def test_polls_are_halfway_between_multiples_of_their_period(wall_s: float) -> N
 pytest.importorskip('rclpy')
 WAIT_S: Final = 60.0
 NUMBERED: Final = get_rmw_implementation_identifier() in FAST_DDS
-"""Whether the RMW numbers messages: what is missed is known then."""
+"""Whether the RMW numbers messages: only then are missed messages known."""
 TYPES: Final = {f'std_msgs/msg/{kind.__name__}': kind for kind in (Int32, String)}
 WARM_UP: Final = String(data='warm-up')
 QUALITIES: Final = {
@@ -63,7 +63,7 @@ PERIOD_S: Final = 0.001
 
 
 class Listening:
-    """A running intake that keeps every message, a program with publishers that was there before it, and one that came after it.
+    """A running intake that keeps every message, a program with publishers that started earlier, and one that started later.
 
     Each sensor has the name of its topic.
     """
@@ -95,20 +95,20 @@ class Listening:
         return one
 
     def _graphs(self) -> str:
-        """Whom each participant sees, and which ports of shared memory there are; killed processes leave theirs."""
+        """The endpoints each participant has discovered, and the shared memory ports; killed processes leave theirs behind."""
         seen = [f'{one.name} sees {sorted(one.node.get_node_names())}' for one in (self.early, self.logger, self.late)]
         ports = range(*(7400 + 250 * number for number in (self._domain, self._domain + 1)))
         left = [path.name for path in FOLDER.glob('fast*_port*') if int(''.join(filter(str.isdigit, path.name))) in ports]
         return f'in domain {self._domain} {", ".join(seen)}; {sorted(left)}'
 
     def received(self, topic: str, count: int) -> None:
-        """Wait until the intake took so many messages of the topic."""
+        """Wait until the intake received this many messages of the topic."""
         until(
             lambda: self._count(topic) >= count, lambda: f'{count} of {topic} are received: {self._accounts.totals().get(topic)}'
         )
 
     def heard(self, publisher: Participant, topic: str, message: Any = WARM_UP) -> None:
-        """Publish the message until the intake took it, so that whatever follows comes after the match."""
+        """Publish the message until the intake received it, so that whatever follows is published after the match."""
         until(lambda: publisher.matched(topic), lambda: f'{topic} is matched: {self._graphs()}')
         before = self._count(topic)
 
@@ -116,10 +116,10 @@ class Listening:
             publisher.publish(message, topic=topic)
             return self._count(topic) > before
 
-        until(is_heard, lambda: f'{topic} is heard')
+        until(is_heard, lambda: f'{topic} is received')
 
     def kept(self, sensor: str, least: int) -> dict[type, list[int]]:
-        """Type -> the numbers that were kept once so many messages of the sensor came, sorted; none were missed."""
+        """Type -> the sorted numbers that were kept, once this many messages of the sensor arrived; none were missed."""
         topic = f'/{sensor}'
         self.received(topic, least)
         assert self._intake.flush(WAIT_S)
@@ -138,7 +138,7 @@ class Listening:
         return {kind: sorted(numbers) for kind, numbers in found.items()}
 
     def numbers(self, sensor: str, least: int) -> list[int]:
-        """The same of a topic of Strings."""
+        """The same for a topic of Strings."""
         return self.kept(sensor, least)[String]
 
     def _count(self, topic: str) -> int:
@@ -166,7 +166,7 @@ def listening() -> Iterator[Listening]:
 @pytest.mark.ros
 @pytest.mark.parametrize('topic', [name for name in EARLY if name != 'early_transient_local'])
 def test_messages_of_an_earlier_publisher_are_taken_once(listening: Listening, topic: str) -> None:
-    """Everything that it publishes after the match is kept, and once."""
+    """Everything it publishes after the match is kept once."""
     listening.heard(listening.early, f'/{topic}')
     listening.early.publish(*texts(range(COUNT)), topic=f'/{topic}', period_s=PERIOD_S)
     assert listening.numbers(topic, COUNT + 1) == list(range(COUNT))
@@ -174,7 +174,7 @@ def test_messages_of_an_earlier_publisher_are_taken_once(listening: Listening, t
 
 @pytest.mark.ros
 def test_the_history_of_a_transient_local_publisher_is_taken_once(listening: Listening) -> None:
-    """The history of a TRANSIENT_LOCAL publisher is kept too, and what follows it once."""
+    """The history of a TRANSIENT_LOCAL publisher is kept too, and everything after it once."""
     listening.received('/early_transient_local', HISTORY)
     listening.early.publish(*texts(range(HISTORY, COUNT)), topic='/early_transient_local', period_s=PERIOD_S)
     assert listening.numbers('early_transient_local', COUNT) == list(range(COUNT))
@@ -182,7 +182,7 @@ def test_the_history_of_a_transient_local_publisher_is_taken_once(listening: Lis
 
 @pytest.mark.ros
 def test_a_latched_and_a_volatile_publisher_are_both_taken(listening: Listening) -> None:
-    """The history of the one that is TRANSIENT_LOCAL and the messages of the one that is not are kept, and once."""
+    """The history of the TRANSIENT_LOCAL one and the messages of the other are kept once."""
     listening.late.create(String, '/both')
     listening.heard(listening.late, '/both')
     listening.early.create(String, '/both', latched=True)
@@ -197,7 +197,7 @@ def test_a_latched_and_a_volatile_publisher_are_both_taken(listening: Listening)
 @pytest.mark.parametrize('kind', ['late', 'expected'])
 @pytest.mark.parametrize('name', QUALITIES)
 def test_messages_of_a_later_publisher_are_taken_once(listening: Listening, kind: str, name: str) -> None:
-    """Everything is kept once, whether its type was known before or is taken from the graph."""
+    """Everything is kept once, whether its type is configured or taken from the graph."""
     topic, publisher = f'{kind}_{name}', listening.late
     publisher.create(String, f'/{topic}', **QUALITIES[name])
     listening.heard(publisher, f'/{topic}')
@@ -207,7 +207,7 @@ def test_messages_of_a_later_publisher_are_taken_once(listening: Listening, kind
 
 @pytest.mark.ros
 def test_an_expected_topic_is_matched_from_its_first_message_on(listening: Listening) -> None:
-    """A publisher of the expected type that waits for its match loses nothing, its first message included."""
+    """A publisher of the expected type that waits for its match loses no message."""
     listening.late.create(String, '/expected_first')
     until(lambda: listening.late.matched('/expected_first'), lambda: 'it is matched')
     listening.late.publish(*texts(range(COUNT)), topic='/expected_first', period_s=PERIOD_S)
@@ -216,7 +216,7 @@ def test_an_expected_topic_is_matched_from_its_first_message_on(listening: Liste
 
 @pytest.mark.ros
 def test_a_publisher_that_restarts_is_taken_once(listening: Listening) -> None:
-    """The messages of both of its lives are kept once. One that is killed is left to test/e2e: it takes a process."""
+    """The messages before and after the restart are kept once. A killed publisher needs a process: see test/e2e."""
     for life in range(2):
         publisher = listening.join(f'life{life}')
         publisher.create(String, '/ended')
@@ -232,7 +232,7 @@ def test_a_publisher_that_restarts_is_taken_once(listening: Listening) -> None:
     ('topic', 'reliable'), [('two_best_effort', (False, False)), ('two_reliable', (True, True)), ('mixed', (False, True))]
 )
 def test_two_publishers_on_a_topic_are_taken_once(listening: Listening, topic: str, reliable: tuple[bool, bool]) -> None:
-    """The messages of both are kept once, also where one is BEST_EFFORT and the other RELIABLE."""
+    """The messages of both are kept once, also if one is BEST_EFFORT and the other RELIABLE."""
     both = (listening.early, listening.late)
     for publisher, quality in zip(both, reliable, strict=True):
         publisher.create(String, f'/{topic}', reliable=quality)
@@ -248,7 +248,7 @@ def test_two_publishers_on_a_topic_are_taken_once(listening: Listening, topic: s
 
 @pytest.mark.ros
 def test_a_topic_may_change_its_type(listening: Listening) -> None:
-    """What is published after the change is kept as the new type, what came before as the old one."""
+    """Messages after the change are kept with the new type, those before it with the old one."""
     publisher = listening.late
     publisher.create(String, '/retyped')
     listening.heard(publisher, '/retyped')
@@ -264,7 +264,7 @@ def test_a_topic_may_change_its_type(listening: Listening) -> None:
 
 @pytest.mark.ros
 def test_a_publisher_that_vanishes_leaves_the_others_alone(listening: Listening) -> None:
-    """When one of two publishers ends, nothing of the other one is lost, though the subscriptions change."""
+    """When one of two publishers ends, nothing from the other is lost, though the subscriptions change."""
     staying, leaving = listening.early, listening.late
     for publisher, reliable in ((staying, False), (leaving, True)):
         publisher.create(String, '/vanishing', reliable=reliable)
@@ -284,7 +284,7 @@ FORGED_WAIT_S = 30.0
 
 
 class Robot:
-    """The way of odometry from DDS to finished objects, and a neighbor who publishes it too."""
+    """The path of odometry from DDS to finished objects, and another robot that publishes it too."""
 
     def __init__(self, domain: int, stack: ExitStack) -> None:
         self.objects: list[DataObject] = []
@@ -307,13 +307,13 @@ class Robot:
         stack.callback(self.intake.close, FORGED_WAIT_S)
 
     def send(self, stamp_ns: int, *, cut: int | None = None) -> None:
-        """An odometry message with this stamp, whole or cut off."""
+        """An odometry message with this stamp, complete or truncated."""
         message = Odometry()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND)
         self.neighbor.publish(bytes(serialize_message(message))[:cut])
 
     def finish(self, received: int) -> None:
-        until(lambda: self._received() >= received, lambda: f'{received} messages came: {self._received()}')
+        until(lambda: self._received() >= received, lambda: f'{received} messages received: {self._received()}')
         assert self.intake.flush(FORGED_WAIT_S)
         assert self.pool.close(FORGED_WAIT_S)
 
@@ -329,7 +329,7 @@ def robot() -> Iterator[Robot]:
 
 
 def test_a_neighbor_adds_nothing_to_a_day_that_is_over(robot: Robot) -> None:
-    """Malformed and whole messages with stamps of a year ago, and ahead, are dated by their arrival, and counted by reason."""
+    """Malformed and valid messages with stamps a year in the past or future are dated by their arrival, and counted by reason."""
     until(robot.neighbor.matched, lambda: 'the neighbor is matched')
     began_ns = time.time_ns()
     robot.send(began_ns)

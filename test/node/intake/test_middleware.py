@@ -1,4 +1,4 @@
-"""The RMW of the node, chosen from an environment, and the reason that is reported."""
+"""The RMW of the node, chosen from an environment, and the reported reason."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CYCLONE = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
 
 @pytest.fixture
 def installed(tmp_path: Path) -> dict[str, str]:
-    """The prefix of a ROS with these RMWs."""
+    """The prefix of a ROS installation with these RMWs."""
     return prefix(tmp_path, KILTED)
 
 
@@ -40,7 +40,7 @@ def prefix(folder: Path, versions: dict[str, str]) -> dict[str, str]:
 
 
 def test_a_robot_with_cyclone_dds_is_received_through_fast_dds(installed: dict[str, str]) -> None:
-    """With the profile in place of the variables that Fast DDS reads in another way than Cyclone DDS."""
+    """The profile replaces the variables that Fast DDS reads differently from Cyclone DDS."""
     robot = {**installed, **CYCLONE, 'ROS_LOCALHOST_ONLY': '1', 'ROS_STATIC_PEERS': '10.0.0.9'}
     found = choose('auto', robot)
     assert (found.rmw, found.robot, found.is_foreign) == ('rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp', True)
@@ -59,14 +59,14 @@ def test_a_robot_with_cyclone_dds_is_received_through_fast_dds(installed: dict[s
 
 
 def test_the_rmw_of_the_robot_may_be_missing_here(tmp_path: Path) -> None:
-    """It is listened to all the same, and no front can speak it."""
+    """Its topics are received anyway, but no front can use the RMW."""
     found = choose('auto', {**prefix(tmp_path, {'rmw_fastrtps_cpp': '9.3.3'}), **CYCLONE})
     assert (found.is_foreign, found.has_robot) == (True, False)
 
 
 @pytest.mark.parametrize('rmw', ['', 'rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp'])
 def test_a_fast_dds_robot_keeps_its_own(installed: dict[str, str], rmw: str) -> None:
-    """Nothing changes but the profile, which is the drivers' with larger buffers; one that the shell names comes back."""
+    """Only the profile changes: it is that of the drivers with larger buffers; a profile set in the shell is restored."""
     shipped = {'FASTDDS_DEFAULT_PROFILES_FILE': '/share/fastdds_shm.xml'}
     environ = {**installed, **shipped, 'RMW_IMPLEMENTATION': rmw, 'ROS_LOCALHOST_ONLY': '1'}
     before = dict(environ)
@@ -88,7 +88,7 @@ def test_a_fast_dds_robot_keeps_its_own(installed: dict[str, str], rmw: str) -> 
 def test_the_operators_fast_dds_settings_are_kept(
     installed: dict[str, str], name: str, value: str, robot: dict[str, str]
 ) -> None:
-    """His profile, his transports and the range of his variables, on either robot."""
+    """The operator's profile, transports and discovery range, on either robot."""
     environ = {**installed, **robot, name: value, 'ROS_LOCALHOST_ONLY': '1'}
     found = choose('auto', environ)
     found.enter(environ)
@@ -99,7 +99,7 @@ def test_the_operators_fast_dds_settings_are_kept(
 
 
 def test_fast_dds_2_has_another_variable(tmp_path: Path) -> None:
-    """That of Humble and Jazzy; and on Humble no range is known."""
+    """That of Humble and Jazzy; on Humble the discovery range is unknown."""
     environ = {**prefix(tmp_path, {'rmw_fastrtps_cpp': '6.2.7'}), **CYCLONE, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     found = choose('fastrtps', environ)
     assert found.profile_variable == 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -108,7 +108,7 @@ def test_fast_dds_2_has_another_variable(tmp_path: Path) -> None:
 
 
 def test_the_first_prefix_counts(tmp_path: Path) -> None:
-    """As it does for everything of ROS: a workspace lies over the distribution."""
+    """As for everything in ROS: a workspace overlays the distribution."""
     over = prefix(tmp_path / 'over', {'rmw_fastrtps_cpp': '6.2.7'})['AMENT_PREFIX_PATH']
     under = prefix(tmp_path / 'under', KILTED)['AMENT_PREFIX_PATH']
     found = choose('fastrtps', {**CYCLONE, 'AMENT_PREFIX_PATH': f'{over}:{under}'})
@@ -128,7 +128,7 @@ def test_the_first_prefix_counts(tmp_path: Path) -> None:
 def test_the_robots_rmw_is_kept_where_fast_dds_would_be_worse(
     tmp_path: Path, versions: dict[str, str], variables: dict[str, str], why: str
 ) -> None:
-    """With the reason, which stands in the first line; nothing of the environment changes."""
+    """With the reason in the first line; the environment is not changed."""
     environ = {**prefix(tmp_path, versions), **variables}
     found = choose('auto', environ)
     assert (found.rmw, found.is_foreign, found.variables) == (variables['RMW_IMPLEMENTATION'], False, {})
@@ -136,7 +136,7 @@ def test_the_robots_rmw_is_kept_where_fast_dds_would_be_worse(
 
 
 def test_a_requested_rmw_is_used_or_rejected(installed: dict[str, str], tmp_path: Path) -> None:
-    """The robot's own on request; Fast DDS also where nobody has measured it, but not where it cannot hear."""
+    """The robot's RMW on request; Fast DDS also if it was not measured, but not if it cannot receive."""
     assert choose('robot', {**installed, **CYCLONE}).rmw == 'rmw_cyclonedds_cpp'
     new = prefix(tmp_path / 'new', {'rmw_fastrtps_cpp': '99.1.0'})
     found = choose('fastrtps', {**new, **CYCLONE})
@@ -148,13 +148,13 @@ def test_a_requested_rmw_is_used_or_rejected(installed: dict[str, str], tmp_path
 
 
 def test_unreadable_settings_are_left_to_ros(tmp_path: Path) -> None:
-    """Who starts the node is told by rcl, as ever, what is wrong with a file."""
+    """As usual, rcl reports what is wrong with a file when the node starts."""
     assert requested_rmw(['--ros-args', '--params-file', str(tmp_path / 'none.yaml')]) == 'auto'
     assert requested_rmw(['--ros-args', '-p', 'capture.rmw:=robot']) == 'robot'
 
 
 def test_the_buffer_is_read_back() -> None:
-    """Of the sockets that this process has: what the kernel gave them, and what it dropped."""
+    """The buffer of this process's sockets: the size the kernel granted, and the packets dropped."""
     before = sockets()
     wanted = possible_buffer()
     assert 0 < wanted <= MAX_BUFFER

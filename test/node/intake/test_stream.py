@@ -1,4 +1,4 @@
-"""What becomes of the messages of a topic between the take and the batch."""
+"""The messages of a topic between the take and the batch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNNUMBERED: dict[str, None] = {'publisher': None, 'number': None}
 
 
 class Batches(list[Batch]):
-    """The queue to the encoders, without end."""
+    """An unbounded queue to the encoders."""
 
     def put(self, batch: Batch, _: int) -> list[Batch]:
         self.append(batch)
@@ -36,7 +36,7 @@ class Batches(list[Batch]):
 
 
 class Talk:
-    """A stream of Strings that are sent every 100 ms, and the sampler that listens to it."""
+    """A stream of Strings sent every 100 ms, and the sampler that receives it."""
 
     def __init__(self, last_stored_ns: int = 0, **settings: float | str) -> None:
         self.sensor = SensorSettings(name='talk', **{'rate_hz': 0.0, 'batch_s': 3600.0, **settings})  # type: ignore[arg-type]
@@ -52,11 +52,11 @@ class Talk:
         self.listen(self.sampler)
 
     def listen(self, *consumers: Consumer) -> None:
-        """Begin a stream."""
+        """Start a stream."""
         self.stream = SensorStream(self.sensor, TOPIC, TYPE, self.accounts, MessageTypes(), self.stamps, consumers)
 
     def messages(self, how_many: int, **fields: object) -> list[Taken]:
-        """The next ones, of a publisher that is known unless ``fields`` say otherwise."""
+        """The next messages, from a known publisher unless ``fields`` override it."""
         taken = [next(self.numbers) for _ in range(how_many)]
         made = [Taken(b'%d' % number, sent_ns := NOON_NS + number * SECOND // 10, 'p', number, sent_ns) for number in taken]
         return [one._replace(**fields) for one in made]  # type: ignore[arg-type]
@@ -70,7 +70,7 @@ class Talk:
         self.sensors[self.sensor.name] = self.sensor
 
     def kept(self) -> list[int]:
-        """The numbers of what was kept, the open batch among it."""
+        """The numbers of the kept messages, including the open batch."""
         self.sampler.flush()
         return [int(sample.cdr) for batch in self.batches for sample in batch.samples]
 
@@ -81,7 +81,7 @@ class Talk:
 
 
 def test_a_pause_counts_and_drops() -> None:
-    """What comes during a pause is received and dropped as paused; before and after it everything is kept."""
+    """Messages during a pause are received and dropped as paused; those before and after it are kept."""
     talk = Talk()
     for paused in (False, True, False):
         talk.add(talk.messages(3), paused=paused)
@@ -90,7 +90,7 @@ def test_a_pause_counts_and_drops() -> None:
 
 
 class Commits(Consumer):
-    """Between the count of a drain's messages and what the others do with them: what a commit shows then as open."""
+    """Commits after a drain's messages are counted and before its consumers run: shows what a commit then counts as open."""
 
     def __init__(self, accounts: Accounts) -> None:
         self.accounts = accounts
@@ -104,7 +104,7 @@ class Commits(Consumer):
     ({'idle': True}, {}, 0), ({'paused': True}, {}, 0), ({}, {'rate_hz': 1.0}, 4), ({}, {}, 30),
 ])  # fmt: skip
 def test_skipped_messages_are_never_open(given: dict[str, bool], settings: dict[str, float], still_open: int) -> None:
-    """A commit at any moment and a kill right then: the next start counts nothing as lost that was to be left out."""
+    """With a commit at any moment and a kill right after it, the next start does not count messages to be skipped as lost."""
     talk = Talk(**settings)
     commits = Commits(talk.accounts)
     talk.listen(commits, talk.sampler)
@@ -113,7 +113,7 @@ def test_skipped_messages_are_never_open(given: dict[str, bool], settings: dict[
 
 
 def test_unwanted_messages_are_skipped() -> None:
-    """Outside of a mission messages are counted as skipped, and those that a pause drops as dropped."""
+    """Outside a mission messages are counted as skipped, and during a pause as dropped."""
     talk = Talk()
     for idle in (True, False, True):
         talk.add(talk.messages(3), idle=idle)
@@ -132,7 +132,7 @@ def test_a_pause_wins_over_the_rate() -> None:
 
 
 def test_a_changed_rate_keeps_the_open_batch() -> None:
-    """The rate changes from one message to the next, and what is in the open batch stays in it."""
+    """The rate changes between two messages, and the open batch keeps its messages."""
     talk = Talk(rate_hz=1.0)
     talk.add(talk.messages(15))
     talk.update(rate_hz=0.0)
@@ -143,7 +143,7 @@ def test_a_changed_rate_keeps_the_open_batch() -> None:
 
 @pytest.mark.parametrize(('rate_hz', 'kept'), [(5.0, [1, 4, 6, 8]), (0.5, [1]), (1.0, [1])])
 def test_another_rate_keeps_nothing_of_a_period_twice(rate_hz: float, kept: list[int]) -> None:
-    """A slower or faster rate goes on after the last message that was kept."""
+    """A slower or faster rate continues after the last kept message."""
     talk = Talk(rate_hz=1.0)
     talk.add(talk.messages(3))
     talk.update(rate_hz=rate_hz, quality=50)
@@ -152,7 +152,7 @@ def test_another_rate_keeps_nothing_of_a_period_twice(rate_hz: float, kept: list
 
 
 def test_messages_kept_before_a_restart_are_not_kept_again() -> None:
-    """A stream that begins anew within a period (a sensor that is switched off and on) waits for the next one."""
+    """A stream that restarts within a period (a sensor that is disabled and enabled) waits for the next one."""
     talk = Talk(rate_hz=1.0, last_stored_ns=NOON_NS + 1)
     talk.add(talk.messages(12))
     assert talk.kept() == [10]
@@ -163,7 +163,7 @@ def test_messages_kept_before_a_restart_are_not_kept_again() -> None:
 
 
 def test_changed_settings_do_not_repeat_unchanged_messages() -> None:
-    """A sensor that keeps changes remembers the last one through a change of its settings."""
+    """A sensor that keeps changes remembers the last message across a change of its settings."""
     talk = Talk(on_change=True)
     talk.add(talk.messages(2, cdr=b'0000same'))
     talk.update(priority=1)
@@ -175,7 +175,7 @@ def test_changed_settings_do_not_repeat_unchanged_messages() -> None:
 
 
 def spoken(talk: Talk, how_many: int, **fields: object) -> None:
-    """The next messages, taken as the intake does: once their time is over."""
+    """The next messages, received as the intake does: in batches, at the end of each interval."""
     for _ in range(how_many):
         taken = talk.messages(1, **fields)
         talk.add(taken, taken[0].source_ns / SECOND)
@@ -183,7 +183,7 @@ def spoken(talk: Talk, how_many: int, **fields: object) -> None:
 
 
 def test_without_numbers_and_rhythm_losses_are_unknown() -> None:
-    """What is not known is None, never 0."""
+    """Unknown is None, never 0."""
     talk = Talk()
     talk.senders.poll(['a'])
     spoken(talk, 3, **UNNUMBERED)
@@ -192,12 +192,12 @@ def test_without_numbers_and_rhythm_losses_are_unknown() -> None:
 
 
 def test_losses_are_counted_from_the_rhythm() -> None:
-    """Once it is known, also what was lost before."""
+    """Once it is known, also for the messages before."""
     talk = Talk()
     talk.senders.poll(['a'])
     for _ in range(3):
         spoken(talk, 100, **UNNUMBERED)
-        talk.messages(7)  # which nobody takes
+        talk.messages(7)  # which the stream does not receive
     spoken(talk, 1, **UNNUMBERED)
     account = talk.account
     assert (account.accounting, account.missed, account.missed_estimated) == (ESTIMATED, None, 21)
@@ -205,7 +205,7 @@ def test_losses_are_counted_from_the_rhythm() -> None:
 
 
 def test_a_declared_rate_needs_no_learning() -> None:
-    """With it even the first gap counts."""
+    """Even the first gap counts."""
     talk = Talk(expected_hz=10.0)
     talk.senders.poll(['a'])
     spoken(talk, 2, **UNNUMBERED)
@@ -215,7 +215,7 @@ def test_a_declared_rate_needs_no_learning() -> None:
 
 
 def test_a_wrong_expected_rate_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    """Messages that come more often refute it: their rhythm is learned."""
+    """Messages that arrive more often refute it: their rhythm is learned."""
     talk = Talk(expected_hz=4.0)
     talk.senders.poll(['a'])
     spoken(talk, 500, **UNNUMBERED)
@@ -224,7 +224,7 @@ def test_a_wrong_expected_rate_is_logged_once(caplog: pytest.LogCaptureFixture) 
 
 
 def test_an_unreadable_counter_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    """Stamps are used then."""
+    """Stamps are used instead."""
     talk = Talk(counter='data')
     talk.senders.poll(['a'])
     spoken(talk, 300, **UNNUMBERED)
@@ -233,7 +233,7 @@ def test_an_unreadable_counter_is_reported(caplog: pytest.LogCaptureFixture) -> 
 
 
 def test_messages_of_another_publisher_are_not_lost() -> None:
-    """Between one publisher and the next there is no loss; between one that went away and came back there is."""
+    """Between one publisher and the next there is no loss; between two runs of the same publisher there is."""
     for successor, lost in (('b', 0), ('a', 50)):
         talk = Talk(expected_hz=10.0)
         talk.senders.poll(['a'])
@@ -248,7 +248,7 @@ def test_messages_of_another_publisher_are_not_lost() -> None:
 
 
 def test_a_second_sender_leaves_the_numbers_of_the_first_alone() -> None:
-    """Messages whose sender nobody knows are received, and no gap in the numbers of the one that goes on."""
+    """Messages of an unknown sender are received, and leave no gap in the numbers of the one that continues."""
     talk = Talk()
     talk.senders.poll(['a'])
     talk.add(talk.messages(3, publisher=None))
@@ -263,7 +263,7 @@ def test_a_second_sender_leaves_the_numbers_of_the_first_alone() -> None:
 
 
 def test_messages_delivered_by_two_subscriptions_are_counted_once() -> None:
-    """A repeat is known by its number, or by time and content where it has none."""
+    """A repeat is recognized by its number, or by time and content if it has none."""
     for fields in ({}, UNNUMBERED):
         talk = Talk()
         taken = talk.messages(3, **fields)
@@ -274,7 +274,7 @@ def test_messages_delivered_by_two_subscriptions_are_counted_once() -> None:
 
 
 def test_a_history_delivered_again_is_counted_once() -> None:
-    """What was taken while one sender was known is known again by its time and number, though nobody can say whose it is."""
+    """Messages received while only one sender was known are recognized by time and number, even if the sender is now unknown."""
     talk = Talk()
     talk.senders.poll(['a'])
     taken = talk.messages(3, publisher=None)
@@ -286,7 +286,7 @@ def test_a_history_delivered_again_is_counted_once() -> None:
 
 
 class Drains(Consumer):
-    """How many messages each had."""
+    """The number of messages of each drain."""
 
     def __init__(self) -> None:
         self.sizes: list[int] = []
@@ -296,7 +296,7 @@ class Drains(Consumer):
 
 
 class Broken(Consumer):
-    """Raises where it is told to."""
+    """Raises when the test sets it to."""
 
     def __init__(self, where: str) -> None:
         self._where = where
@@ -312,7 +312,7 @@ class Broken(Consumer):
 
 @pytest.mark.parametrize(('where', 'said'), [('choose', 'ValueError: a defect'), ('take', "KeyError: '/talk'")])
 def test_a_failing_consumer_does_not_affect_the_others(where: str, said: str, caplog: pytest.LogCaptureFixture) -> None:
-    """Those before it and after it get every drain; it is counted, and named in the log, not each time."""
+    """Those before and after it get every drain; the failure is counted, and logged by name, but not each time."""
     talk, broken, last = Talk(), Broken(where), Drains()
     talk.listen(broken, talk.sampler, last)
     for _ in range(3):
@@ -326,7 +326,7 @@ def test_a_failing_consumer_does_not_affect_the_others(where: str, said: str, ca
 
 
 def test_messages_of_a_failing_sampler_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its messages are not open until the node ends, with the journal complete beyond them."""
+    """They do not stay open until the node ends, with a journal that is complete beyond them."""
     talk, last = Talk(), Drains()
     talk.listen(talk.sampler, last)
     talk.add(talk.messages(2))
@@ -340,7 +340,7 @@ def test_messages_of_a_failing_sampler_are_dropped(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_topic_without_a_sensor_reaches_the_other_consumers() -> None:
-    """As above, where the consumers themselves asked for it."""
+    """As above, for topics that only these consumers requested."""
     broken, other = Broken('take'), Drains()
     other.topics = frozenset({TOPIC})
     TopicStream(TOPIC, TYPE, MessageTypes(), Talk().stamps, (broken, other)).add(Talk().messages(4), Senders(), 0.0, paused=False)
@@ -348,13 +348,13 @@ def test_a_topic_without_a_sensor_reaches_the_other_consumers() -> None:
 
 
 def test_the_watermark_ends_before_open_messages() -> None:
-    """A message that is kept may still be lost while it is in the open batch, in the queue or in an encoder."""
+    """A kept message may still be lost while it is in the open batch, the queue or an encoder."""
     talk = Talk(batch_s=1.0)
     queue = talk.sampler._queue = BatchQueue(QueueSettings())
     talk.accounts.oldest_open = talk.sampler.oldest_open
 
     def complete() -> int:
-        """In messages, after two commits: what had its outcome at the first is durable with the second."""
+        """The watermark in messages, after two commits: an outcome at the first is durable with the second."""
         for _ in range(2):
             talk.accounts.reject(TOPIC, {})
             taken = talk.accounts.snapshot({})
@@ -382,7 +382,7 @@ def test_the_watermark_ends_before_open_messages() -> None:
     (60 * SECOND, NOON_NS, {'sent_before_2024': 1}), (NOON_NS - DAY_NS // 2, NOON_NS, {'sent_erratic': 1}),
 ])  # fmt: skip
 def test_forged_stamps_do_not_date_losses(sent_ns: int, dated_ns: int, why: dict[str, int]) -> None:
-    """A gap before a message with a forged time of sending is dated by its arrival, and the message is counted by reason."""
+    """A gap before a message with a forged send time is dated by its arrival, and the message is counted by reason."""
     talk = Talk()
     talk.add([Taken(b'1', NOON_NS - SECOND, 'p', 1, NOON_NS - SECOND), Taken(b'5', sent_ns, 'p', 5, NOON_NS)])
     snapshot = talk.accounts.snapshot({})

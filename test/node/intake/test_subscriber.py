@@ -1,4 +1,4 @@
-"""Topics with two types, and topics of services and actions, over real DDS: the configured type is logged, others are counted."""
+"""Topics with two types, and topics of services and actions, over real DDS: the configured type is logged, others counted."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ pytestmark = pytest.mark.ros
 WAIT_S: Final = 60.0
 INT, STRING, FLOAT = (f'std_msgs/msg/{name}' for name in ('Int32', 'String', 'Float64'))
 ABSENT: Final = 'no_such_msgs/msg/Thing'
-"""A history of ten messages: what is published between two drains beyond that is missed."""
+"""A history of ten messages: more than that published between two drains is missed."""
 HISTORY: Final = 10
 NUMBERED: Final = get_rmw_implementation_identifier() in FAST_DDS
-"""Whether the RMW numbers messages: what is missed is known then."""
+"""Whether the RMW numbers messages: only then are missed messages known."""
 NOTHING: Final = Totals('', None, 0, 0, 0, 0, 0, 0, None, None, 0)
 
 
 class Listening(Participant):
-    """A sensor's subscriber as the intake has it, polled by the test."""
+    """A sensor's subscriber as in the intake, polled by the test."""
 
     def __init__(self, domain: int) -> None:
         super().__init__('logger', domain)
@@ -79,7 +79,7 @@ class Listening(Participant):
         self.source = Subscriber(around, sensor, [self.sampler], self.others)
 
     def turn(self) -> None:
-        """One round of the intake."""
+        """One iteration of the intake."""
         now_s = time.monotonic()
         self.source.refresh(now_s)
         self.source.drain(now_s)
@@ -93,7 +93,7 @@ class Listening(Participant):
             time.sleep(0.02)
 
     def refused(self, topic: str, squatter: Participant, *messages: Any) -> int:
-        """How many messages of another type are counted, once all of these are: they begin when one got through."""
+        """The number of counted messages of another type, once all of these are: counting starts with the first one received."""
         while not self.totals(topic).rejected:
             squatter.publish(messages[0])
             self.until(squatter.matched, 'it is matched')
@@ -106,14 +106,14 @@ class Listening(Participant):
         return before + len(messages)
 
     def numbers(self) -> list[int]:
-        """What the sensor logged so far, all of it of one type."""
+        """The numbers logged by the sensor so far, all of one type."""
         self.source.drain(time.monotonic())
         self.sampler.flush()
         assert {batch.type for batch in self.batches} <= {INT}
         return [deserialize_message(sample.cdr, Int32).data for batch in self.batches for sample in batch.samples]
 
     def depth(self) -> int:
-        """Of its shortest history."""
+        """Depth of its shortest history."""
         return min(reader.plan.depth for reader in self.source._readers)
 
     def totals(self, topic: str) -> Totals:
@@ -147,7 +147,7 @@ def ints(count: int, first: int = 0) -> list[Int32]:
 def test_the_configured_type_wins(
     make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch, order: str, *, reliable: bool
 ) -> None:
-    """Whoever came first, with whatever QoS: the sensor's own messages are logged and their gaps counted, the others refused."""
+    """In any order and with any QoS: the sensor's messages are logged and their gaps counted, the others refused."""
     monkeypatch.setattr(endpoints, 'SMALL_RATE_HZ', HISTORY / endpoints.STALL_S)
     logger, robot, squatter = make('logger'), make('robot'), make('squatter')
     steps = {
@@ -164,7 +164,7 @@ def test_the_configured_type_wins(
     refused = logger.refused('/odom', squatter, *[String(data='I am odometry')] * 5)
     robot.publish(*ints(5))
     logger.until(lambda: logger.totals('/odom').received == refused + 5, 'its own are received')
-    robot.publish(*ints(4 * HISTORY, 5))  # nobody takes meanwhile: all but the last ones are gone
+    robot.publish(*ints(4 * HISTORY, 5))  # not drained in between: all but the last ones are lost
     logger.until(lambda: logger.totals('/odom').received == refused + 5 + HISTORY, 'the last ones are received')
     assert logger.numbers() == [*range(5), *range(5 + 3 * HISTORY, 5 + 4 * HISTORY)]
     totals = logger.totals('/odom')
@@ -177,7 +177,7 @@ def test_the_configured_type_wins(
 
 
 def test_an_uninstalled_type_is_reported(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """How many messages of it there are is unknown, and not 0; the sensor's own account stays exact."""
+    """The number of such messages is unknown, not 0; the sensor's account stays exact."""
     real = module.unavailable
     monkeypatch.setattr(module, 'unavailable', lambda name: 'not here' if name == STRING else real(name))
     logger, robot, squatter = make('logger'), make('robot'), make('squatter')
@@ -196,7 +196,7 @@ def test_an_uninstalled_type_is_reported(make: Callable[[str], Any], monkeypatch
 
 
 def test_a_third_type_is_not_counted(make: Callable[[str], Any]) -> None:
-    """One other type of a topic is listened to; of any further one the count is unknown."""
+    """One other type per topic is received; for more the count is unknown."""
     logger, first, second = make('logger'), make('first'), make('second')
     logger.listen('/odom', INT)
     first.create(String, '/odom')
@@ -209,7 +209,7 @@ def test_a_third_type_is_not_counted(make: Callable[[str], Any]) -> None:
 
 
 def test_the_number_of_types_is_limited(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever makes many costs no more subscriptions than that."""
+    """A client that creates many types costs no more subscriptions than that."""
     monkeypatch.setattr(module, 'MAX_OTHERS', 0)
     logger, squatter = make('logger'), make('squatter')
     logger.listen('/odom', INT)
@@ -220,16 +220,16 @@ def test_the_number_of_types_is_limited(make: Callable[[str], Any], monkeypatch:
 
 
 def test_without_a_configured_type_the_first_is_kept(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """More publishers of another type change nothing while it has one; of what cannot be heard the loss is unknown."""
+    """More publishers of another type change nothing while it has one; the loss of messages it cannot receive is unknown."""
     logger, robot = make('logger'), make('robot')
     robot.create(Int32, '/odom')
     logger.listen('/odom')
-    logger.until(robot.matched, 'the first is heard')
+    logger.until(robot.matched, 'the first publisher is matched')
     for name in ('one', 'two'):
         make(name).create(String, '/odom')
     logger.until(lambda: logger.totals('/odom').other_types, 'the others are seen')
     robot.publish(*ints(3))
-    logger.until(lambda: logger.totals('/odom').received == 3, 'the first goes on')
+    logger.until(lambda: logger.totals('/odom').received == 3, 'messages of the first publisher arrive')
     assert logger.numbers() == [0, 1, 2]
     assert logger.totals('/odom').missed == (0 if NUMBERED else None)
     real = module.unavailable
@@ -240,7 +240,7 @@ def test_without_a_configured_type_the_first_is_kept(make: Callable[[str], Any],
 
 
 def test_a_dead_publisher_in_the_graph_does_not_count(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its type gives way to the one that is published now: no node has it any more (Fast DDS 2.6 beside Cyclone DDS)."""
+    """Its type is replaced by the one published now: no node has it any more (Fast DDS 2.6 next to Cyclone DDS)."""
     logger, robot = make('logger'), make('robot')
     real, seen = module.endpoints, {}
 
@@ -253,18 +253,18 @@ def test_a_dead_publisher_in_the_graph_does_not_count(make: Callable[[str], Any]
     robot.create(String, '/odom')
     logger.listen('/odom')
     logger.until(lambda: any(each.node for each in seen.values()), 'it is known as of its node')
-    logger.until(robot.matched, 'it is heard')
+    logger.until(robot.matched, 'the publisher is matched')
     robot.leave()
     robot.create(Int32, '/odom')
     logger.until(lambda: logger.source.status().publishers == 1 and logger.totals('/odom').type == INT, 'the other type is taken')
-    logger.until(robot.matched, 'the successor is heard')
+    logger.until(robot.matched, 'its successor is matched')
     robot.publish(*ints(3))
     logger.until(lambda: logger.totals('/odom').received == 3, 'it is received')
     assert logger.numbers() == [0, 1, 2]
 
 
 def test_a_publisher_of_another_type_does_not_make_a_topic_preferred(make: Callable[[str], Any]) -> None:
-    """A sensor goes to its second topic while nobody publishes the first one with its type."""
+    """A sensor uses its second topic while the first has no publisher of its type."""
     logger, robot, squatter = make('logger'), make('robot'), make('squatter')
     squatter.create(String, '/preferred')
     robot.create(Int32, '/second')
@@ -276,7 +276,7 @@ def test_a_publisher_of_another_type_does_not_make_a_topic_preferred(make: Calla
 
 
 def test_an_abandoned_topic_gets_its_new_type(make: Callable[[str], Any]) -> None:
-    """A sensor that is switched off listens to nothing of its topic any more."""
+    """A disabled sensor has no subscription to its topic any more."""
     logger, squatter = make('logger'), make('squatter')
     logger.listen('/odom', INT)
     squatter.create(String, '/odom')
@@ -287,19 +287,19 @@ def test_an_abandoned_topic_gets_its_new_type(make: Callable[[str], Any]) -> Non
 
 @pytest.mark.skipif(get_rmw_implementation_identifier() not in FAST_DDS, reason='Cyclone DDS lets a program have both types')
 def test_a_topic_that_the_node_publishes_keeps_its_type(make: Callable[[str], Any]) -> None:
-    """What this node publishes itself can be had in that type alone: another one is told, and stops nothing."""
+    """What this node publishes itself can be received in that type only: another one is reported, and stops nothing."""
     logger, squatter = make('logger'), make('squatter')
     logger.create(Int32, '/own')
     logger.leave()
     logger.create(Int32, '/own')
     squatter.create(String, '/own')
     logger.listen('/own', STRING)
-    logger.until(lambda: logger.source.status().unavailable, 'it is told')
-    assert f'no subscription of type {STRING} can be made' in logger.source.status().unavailable  # Humble's rcl loses the reason
+    logger.until(lambda: logger.source.status().unavailable, 'the other type is reported')
+    assert f'no subscription of type {STRING} can be made' in logger.source.status().unavailable  # Humble's rcl drops the reason
 
 
 def test_a_topic_faster_than_its_history_gets_a_longer_one(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is lost or counted twice as one subscription takes over from the other, and then a stall fits into it."""
+    """Nothing is lost or counted twice as one subscription replaces the other, and afterwards a stall fits into it."""
     monkeypatch.setattr(endpoints, 'SMALL_RATE_HZ', HISTORY / endpoints.STALL_S)
     logger, robot = make('logger'), make('robot')
     logger.listen('/odom', INT)
@@ -337,7 +337,7 @@ class Robot(Participant):
         super().end()
 
     def offer_trigger(self) -> Callable[[], Any]:
-        """What calls the service once; both of its sides publish events with their contents."""
+        """Calls the service once; both sides publish service events with contents."""
         introspection = pytest.importorskip('rclpy.service_introspection', reason='Humble has no service events')
         from rclpy.qos import qos_profile_system_default
         from std_srvs.srv import Trigger
@@ -355,7 +355,7 @@ class Robot(Participant):
         return lambda: client.wait_for_service(10.0) and client.call_async(Trigger.Request())
 
     def offer_fibonacci(self) -> Callable[[], Any]:
-        """What sends a goal once; the action gives feedback once."""
+        """Sends a goal once; the action gives feedback once."""
         action = pytest.importorskip('test_msgs.action').Fibonacci
 
         def execute(goal: Any) -> Any:
@@ -384,7 +384,7 @@ def logger(domain: int) -> Iterator[Listening]:
 
 
 def received(logger: Listening, topic: str, type_name: str, robot: Robot, call: Callable[[], Any], count: int) -> Batch:
-    """What the logger receives of a topic when its publisher is made to publish."""
+    """Messages that the logger receives from a topic when its publisher is made to publish."""
     logger.listen(topic)
     robot.run()
     logger.until(lambda: logger.source.status().matched, 'it is matched')
@@ -399,7 +399,7 @@ def received(logger: Listening, topic: str, type_name: str, robot: Robot, call: 
 
 
 def documents(batch: Batch) -> list[dict[str, Any]]:
-    """The messages of a batch as the JSON has them."""
+    """The messages of a batch as JSON."""
     sensor = SensorSettings(name='sensor', topics=(batch.topic,), rate_hz=0.0, batch_s=1.0, format='json')
     made = encode(batch, sensor, 'thor', MessageTypes(os.environ['AMENT_PREFIX_PATH'].split(':')))
     assert made.object is not None
@@ -409,7 +409,7 @@ def documents(batch: Batch) -> list[dict[str, Any]]:
 
 
 def read_as_bag(batch: Batch, folder: Path) -> list[Any]:
-    """The messages of a batch as another reader has them, from a slice that defines its type."""
+    """The messages of a batch as another reader decodes them, from a slice that defines its type."""
     folder.mkdir()
     writer = SliceWriter(folder / f'{folder.name}_0.mcap')
     channel = Channel(batch.topic, batch.type, *describe(batch.type), '')
@@ -432,7 +432,7 @@ def test_service_events_are_logged(robot: Robot, logger: Listening, tmp_path: Pa
 
 
 def test_feedback_of_an_action_is_logged(robot: Robot, logger: Listening, tmp_path: Path) -> None:
-    """The feedback of an action is logged, and can be read from a bag without ROS."""
+    """It can be read from a bag without ROS."""
     call = robot.offer_fibonacci()
     batch = received(logger, '/count/_action/feedback', 'test_msgs/action/Fibonacci_FeedbackMessage', robot, call, 1)
     (sample,) = documents(batch)
@@ -443,7 +443,6 @@ def test_feedback_of_an_action_is_logged(robot: Robot, logger: Listening, tmp_pa
 
 
 def test_the_status_of_goals_is_logged(robot: Robot, logger: Listening, tmp_path: Path) -> None:
-    """The states of an action's goals are logged."""
     call = robot.offer_fibonacci()
     batch = received(logger, '/count/_action/status', 'action_msgs/msg/GoalStatusArray', robot, call, 3)
     assert [goal['status'] for goal in documents(batch)[-1]['status_list']] == [4]

@@ -1,4 +1,4 @@
-"""Publishers that the front finds and the node does not are reported after a while, until they are found or gone."""
+"""Publishers that only the front discovers are reported after a while, until they are discovered or gone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STEP_S = 2.0
 
 
 class Robot:
-    """A graph of each side; ``wait`` lets time go by while the front reports every other second."""
+    """A graph on each side; ``wait`` lets time pass while the front reports every two seconds."""
 
     def __init__(self, **topics: str) -> None:
         self.now_s = 100.0
@@ -38,7 +38,7 @@ class Robot:
 
 
 def test_an_undiscovered_publisher_is_reported_until_it_is_found(caplog: pytest.LogCaptureFixture) -> None:
-    """Once in the log, with topic, node, both RMWs and what to do; and that it is over."""
+    """Once in the log, with topic, node, both RMWs and what to do; and again when it ends."""
     caplog.set_level(logging.INFO)
     robot = Robot(imu=IMU)
     robot.theirs = {'/imu': [['aa', IMU, '/go2_driver']]}
@@ -60,7 +60,7 @@ def test_an_undiscovered_publisher_is_reported_until_it_is_found(caplog: pytest.
 
 @pytest.mark.parametrize('of', ['their ghost', 'a stop of ours', 'restarts'])
 def test_a_short_difference_is_not_reported(of: str, caplog: pytest.LogCaptureFixture) -> None:
-    """A publisher that was killed lingers; while this process was stopped nobody compared; each publisher counts for itself."""
+    """A killed publisher lingers; while this process was stopped nothing was compared; each publisher counts separately."""
     robot = Robot(imu=IMU)
     robot.theirs = {'/imu': [['aa', IMU, '']]}
     if of == 'their ghost':
@@ -82,7 +82,7 @@ def test_a_short_difference_is_not_reported(of: str, caplog: pytest.LogCaptureFi
 
 
 def test_without_reports_nothing_is_known() -> None:
-    """Before the first report, and when the front has gone."""
+    """Before the first report, and after the front stopped."""
     robot = Robot(imu=IMU)
     assert robot.texts is None
     robot.theirs = {'/imu': [['aa', IMU, '']]}
@@ -93,7 +93,7 @@ def test_without_reports_nothing_is_known() -> None:
 
 
 def test_only_topics_that_would_be_logged_count() -> None:
-    """Of the topics of sensors that are enabled now, and of the type that is named for them; where none is, of any."""
+    """Topics of enabled sensors, and of the type configured for them; without one, of any type."""
     robot = Robot(imu=IMU, odom='')
     robot.theirs = {
         '/imu': [['aa', 'std_msgs/msg/String', '']],
@@ -109,13 +109,13 @@ def test_only_topics_that_would_be_logged_count() -> None:
 
 @pytest.mark.parametrize('wrong', [7, {'a': 1}, [7], [['aa']], [['aa', 'b', 7]], [[['aa'], 'b', 'c']]])
 def test_an_invalid_report_is_ignored(wrong: Any) -> None:
-    """Whoever has the control socket may send what he likes."""
+    """Any client of the control socket may send anything."""
     robot = Robot(imu=IMU)
     assert robot.undiscovered.compare({'/imu': wrong}) == {'topics': ['/imu'], 'gids': []}
 
 
 def test_the_front_learns_the_known_publishers() -> None:
-    """So that a report has only what is beyond that, and is short."""
+    """A report then has only the others, and is short."""
     robot = Robot(imu=IMU, odom='')
     robot.ours = {'/imu': {'bb', 'aa'}, '/odom': {'cc'}}
     assert robot.undiscovered.compare({}) == {'topics': ['/imu', '/odom'], 'gids': ['aa', 'bb', 'cc']}
@@ -125,7 +125,7 @@ def test_the_front_learns_the_known_publishers() -> None:
     (2, 'finds 2 publishers that'), (MAX_PUBLISHERS, f'finds {MAX_PUBLISHERS} or more publishers'),
 ])  # fmt: skip
 def test_several_undiscovered_publishers_are_one_error(count: int, words: str, caplog: pytest.LogCaptureFixture) -> None:
-    """A report has no more of them than a limit, so the words claim no number then."""
+    """The number in a report is limited, so the message contains no count then."""
     robot = Robot(imu=IMU)
     robot.theirs = {'/imu': [[f'{number}', IMU, ''] for number in range(count)]}
     robot.wait(SETTLED_S + STEP_S)

@@ -1,4 +1,4 @@
-"""What stays on the robot, and the previews that are sent of it at once."""
+"""Objects kept on the robot, and their previews, which are sent immediately."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def keeping(**parameters: Any) -> Keeping:
 
 
 def picture(kind: str = 'JPEG', mode: str = 'RGB') -> bytes:
-    """Noise, which no file format makes small."""
+    """Noise, which no file format can compress."""
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     out = BytesIO()
     Image.fromarray(noise).convert(mode).save(out, kind)
@@ -48,7 +48,7 @@ def frame(body: bytes, content_type: str = 'image/jpeg', after_s: float = 0.0, *
     (pack_tar([ArchiveFile('1.jpg', NOON_NS, picture()), ArchiveFile('1.json', NOON_NS, b'{}')]), 'application/x-tar'),
 ])  # fmt: skip
 def test_a_preview_is_small_and_names_its_original(body: bytes, content_type: str) -> None:
-    """A JPEG of at most 5 KB, with the place of the picture; it is bookkeeping, and does not stay on the robot itself."""
+    """A JPEG of at most 5 KB, with the position of the image; it is housekeeping, and is not kept on the robot."""
     keeper = keeping()
     kept = keeper.mark(frame(body, content_type))
     found = keeper.preview(kept)
@@ -62,7 +62,7 @@ def test_a_preview_is_small_and_names_its_original(body: bytes, content_type: st
 
 
 def test_one_preview_is_kept_per_second() -> None:
-    """The first of each; of none where they are not wanted, nor of what is sent anyway."""
+    """The first of each second; none if previews are disabled, or for objects that are sent anyway."""
     keeper, body = keeping(), picture()
     made = [keeper.preview(keeper.mark(frame(body, after_s=number / 5))) for number in range(10)]
     assert [one is not None for one in made] == [True, *[False] * 4, True, *[False] * 4]
@@ -80,7 +80,7 @@ def test_one_preview_is_kept_per_second() -> None:
 ], ids=['no picture', 'cut off', 'cut archive', 'depth'])  # fmt: skip
 @pytest.mark.parametrize('content_type', ['image/jpeg', 'application/zip', 'application/x-tar'])
 def test_an_object_without_an_image_has_no_preview(make_body: Callable[[], bytes], content_type: str) -> None:
-    """And is kept all the same."""
+    """And is kept anyway."""
     keeper = keeping()
     kept = keeper.mark(frame(make_body(), content_type))
     assert kept.is_on_request
@@ -88,7 +88,7 @@ def test_an_object_without_an_image_has_no_preview(make_body: Callable[[], bytes
 
 
 def test_missions_of_named_types_and_events_are_sent(tmp_path: Any) -> None:
-    """Whatever their sensors and bags do otherwise."""
+    """Regardless of their sensors' and bags' settings."""
     keeper = keeping()
     inspection, patrol = (make(metadata={meta.MISSION_TYPE: name}) for name in ('inspection', 'patrol'))
     assert not keeper.mark(inspection).is_on_request

@@ -1,4 +1,4 @@
-"""How fast uploads went, and where."""
+"""Upload speed by position."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ IDLE = UploadStatus('idle', '', 0, 0, 0, 0, 0)
 
 
 class Link:
-    """Time, and an uploader that sends as told."""
+    """Time, and an uploader that sends as the test sets it."""
 
     def __init__(self) -> None:
         self.clock, self.now_s, self.status = FakeClock(), 0.0, IDLE
@@ -46,7 +46,7 @@ class Link:
 
 
 def test_a_sample_is_five_seconds_without_a_pause() -> None:
-    """What was sent in bursts says nothing of the link, and an outage is 0 where the robot was."""
+    """Bursts are no measure of the link, and an outage is 0 at the robot's position."""
     link = Link()
     link.send(11, 500_000)
     link.send(3, 0, 'idle')
@@ -60,7 +60,7 @@ def test_a_sample_is_five_seconds_without_a_pause() -> None:
 
 
 def test_the_first_object_comes_after_a_minute_and_others_after_ten() -> None:
-    """So that a pace is known soon; and nothing is made where nothing was sent."""
+    """So that a speed is known early; and no object is created if nothing was sent."""
     link = Link()
     assert link.track.poll(is_last=True) is None
     link.send(65, 1000)

@@ -19,7 +19,7 @@ from shadowhound_data_logger.node.keeping.upload_rules import STALE_S, UploadRul
 
 
 class Kernel:
-    """Answers as ``ioctl`` does for ``SIOCGIWESSID``: writes where the request says."""
+    """Responds as ``ioctl`` does to ``SIOCGIWESSID``: writes to the address in the request."""
 
     def __init__(self, networks: dict[str, bytes | OSError]) -> None:
         self._networks = networks
@@ -65,7 +65,7 @@ def test_networks_of_this_machine_are_read() -> None:
 
 
 def test_a_rule_that_waits_for_an_unpublished_topic_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After a minute, with what to do; not before, and not once somebody publishes it."""
+    """After a minute, with a remedy; not before, and not once the topic has a publisher."""
     now_s, publishers = [1000.0], {'/lowstate': 0}
     monkeypatch.setattr(upload_rules, 'time', SimpleNamespace(monotonic=lambda: now_s[0]))
     node: Any = SimpleNamespace(resolve_topic_name=lambda topic: f'/{topic}', count_publishers=publishers.__getitem__)

@@ -1,4 +1,4 @@
-"""What the bag process reports about its bag; the real recordings are in test/bags/test_record.py."""
+"""The bag process's reports about its bag; the real recordings are in test/bags/test_record.py."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shadowhound_data_logger.spool.spool import Spool
 
 
 def _writer(folder: Path, *ended: Manifest) -> ManifestWriter:
-    """It was handed these, in this order; it is not open."""
+    """A writer that accepted these slices, in this order; it is not open."""
     writer = ManifestWriter(Spool(folder, SpoolSettings(), SystemClock('a-boot'), 'thor'))
     for manifest in ended:
         writer.put(DataObject(
@@ -29,7 +29,7 @@ def _manifest(bag: str, state: str = COMPLETE, clock: ClockOf | None = None) -> 
 
 
 def test_an_older_bag_is_not_mistaken_for_the_new_one(tmp_path: Path) -> None:
-    """What an earlier process left is made whole meanwhile, before our bag ends or after it."""
+    """A bag left by an earlier process is repaired during that time, before our bag ends or after it."""
     ours, older = _manifest('patrol_20251018_120000'), _manifest('patrol_20251018_110000', RECOVERED)
     assert _writer(tmp_path, older, ours).manifest_of(ours.bag) == ours
     assert _writer(tmp_path, ours, older).manifest_of(ours.bag) == ours
@@ -37,7 +37,7 @@ def test_an_older_bag_is_not_mistaken_for_the_new_one(tmp_path: Path) -> None:
 
 
 def test_a_bag_is_found_after_the_clock_was_set(tmp_path: Path) -> None:
-    """It has another name then, and its manifest says when it began."""
+    """It has another name then, and its manifest has the start time."""
     began_as = unsynced_name('patrol', 'b-boot', 12 * SECOND, lambda _: False)
     ours = _manifest('patrol_20251018_120000', clock=ClockOf('set_later', 'b-boot', 12 * SECOND + 5, 7, 8))
     older = _manifest('patrol_20251018_110000', clock=ClockOf('set_later', 'a-boot', 12 * SECOND, 7, 8))

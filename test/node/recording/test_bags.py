@@ -31,7 +31,7 @@ STAMPS = StampRule(SystemClock.of_this_machine())
 
 
 class Graph:
-    """A node that knows of one publisher without QoS of note; counts how often it is asked."""
+    """A node that knows one publisher with ordinary QoS; counts the queries."""
 
     def __init__(self, durability: int = 2, lifespan_ns: int = 0) -> None:
         self.asked = 0
@@ -51,7 +51,7 @@ class Graph:
 
 
 class Ear:
-    """The bag's consumer behind a stream: of a sensor that keeps one message a second, or of the bag alone."""
+    """The bag's consumer behind a stream: of a sensor that keeps one message per second, or of the bag alone."""
 
     def __init__(self, *, own: bool, max_bytes: int = 1 << 20, graph: Graph | None = None) -> None:
         self.accounts, self.queue, self.batches = Accounts(), BagQueue(max_bytes), Batches()
@@ -68,7 +68,7 @@ class Ear:
         self.begin()
 
     def begin(self) -> None:
-        """As the intake does it."""
+        """Start as the intake does."""
         self.bags.begin()
         self.bags.topics = frozenset({TOPIC})
 
@@ -77,7 +77,7 @@ class Ear:
         self.stream.add(taken, Senders(), 0.0, paused=paused)
 
     def heard(self) -> list[int]:
-        """The numbers of what the bag got."""
+        """The numbers of the messages in the bag."""
         numbers = []
         while (item := self.queue.next()) is not None:
             assert isinstance(item, MessageBatch)
@@ -87,7 +87,7 @@ class Ear:
         return [number for number in numbers if number is not None]
 
     def record_again(self) -> None:
-        """The recording ends and another one begins, with a subscription of its own."""
+        """The recording ends and another one starts, with a separate subscription."""
         self.begin()
         self.stream = TopicStream(TOPIC, TYPE, MessageTypes(), STAMPS, [self.bags])
 
@@ -107,7 +107,7 @@ def ear(request: pytest.FixtureRequest) -> Ear:
 
 
 def test_every_message_is_passed_on_once(ear: Ear) -> None:
-    """In the order of arrival, also what came twice by two subscriptions; a gap is missed, as for the sensors."""
+    """In order of arrival, also if two subscriptions deliver it; a gap is missed, as for the sensors."""
     ear.add(messages(1, 2, 3))
     ear.add(messages(3, 4, 7))
     assert ear.heard() == [1, 2, 3, 4, 7]
@@ -116,14 +116,14 @@ def test_every_message_is_passed_on_once(ear: Ear) -> None:
 
 
 def test_repeats_without_a_sender_are_dropped(ear: Ear) -> None:
-    """By time of sending and number."""
+    """By send time and number."""
     ear.add(messages(1, 2, publisher=None))
     ear.add(messages(2, 3, publisher=None))
     assert ear.heard() == [1, 2, 3]
 
 
 def test_estimated_losses_are_in_the_manifest(ear: Ear) -> None:
-    """What came before it was known stays unknown; what is lost after that is estimated, by the same rhythm as the sensor's."""
+    """The time before the rhythm is known stays unknown; later losses are estimated, by the same rhythm as the sensor's."""
     senders = Senders()
     senders.poll(['a'])
     for start in (*range(0, 300, 20), *range(340, 400, 20)):
@@ -136,7 +136,7 @@ def test_estimated_losses_are_in_the_manifest(ear: Ear) -> None:
 
 
 def test_a_pause_counts_and_drops(ear: Ear) -> None:
-    """That of the node and that of the bag alike."""
+    """A pause of the node and one of the bag."""
     ear.add(messages(1, 2), paused=True)
     ear.queue.paused = True
     ear.add(messages(3))
@@ -147,7 +147,7 @@ def test_a_pause_counts_and_drops(ear: Ear) -> None:
 
 
 def test_recording_does_not_change_what_the_sensor_keeps() -> None:
-    """Sampling, and outside of a mission nothing, while the bag gets all of it."""
+    """With sampling, and with nothing outside a mission, the bag gets all messages."""
     ear = Ear(own=False)
     ear.add(messages(*range(1, 151)))
     ear.add(messages(200), idle=True)
@@ -159,7 +159,7 @@ def test_recording_does_not_change_what_the_sensor_keeps() -> None:
 
 
 def test_a_topic_that_is_not_recorded_costs_nothing() -> None:
-    """It has no account, and nothing waits."""
+    """It has no account, and nothing is queued."""
     ear = Ear(own=False)
     ear.bags.topics = frozenset()
     ear.add(messages(1, 2))
@@ -168,7 +168,7 @@ def test_a_topic_that_is_not_recorded_costs_nothing() -> None:
 
 
 def test_a_full_queue_drops_the_newest() -> None:
-    """And counts them; what is taken out makes room again."""
+    """And counts them; taking messages out makes room again."""
     ear = Ear(own=True, max_bytes=24)
     ear.add(messages(1, 2, 3, 4, 5))
     assert ear.account.dropped == {'queue_full': 2}
@@ -178,7 +178,7 @@ def test_a_full_queue_drops_the_newest() -> None:
 
 
 def test_latched_messages_are_in_each_bag() -> None:
-    """A second recording gets what is delivered again, once; nothing of it counts as missed."""
+    """A second recording gets the redelivered messages, once; none of them counts as missed."""
     ear = Ear(own=True)
     ear.add(messages(1, 2))
     assert ear.heard() == [1, 2]
@@ -205,7 +205,7 @@ def test_latched_messages_are_marked(durability: int, lifespan_ns: int, latched:
 
 
 def test_messages_latched_during_a_pause_are_remembered() -> None:
-    """It is counted and dropped as anything else, and put for the slices that follow."""
+    """They are counted and dropped as any other, and added to the slices that follow."""
     ear = Ear(own=True, graph=Graph(durability=1), max_bytes=8)
     ear.queue.paused = True
     ear.add(messages(1))
@@ -219,7 +219,7 @@ def test_messages_latched_during_a_pause_are_remembered() -> None:
 
 @pytest.mark.parametrize(('named', 'expected'), [((), {'/imu', '/odom'}), (('/rosout',), {'/rosout'})])
 def test_topics_of_the_ring_alone_are_in_a_bag_only_if_named(named: tuple[str, ...], expected: set[str]) -> None:
-    """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
+    """By default a bag has the sensors' topics, whatever events keep; a named topic needs no extra subscription."""
     bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, wanted_topics=TopicChoice(BagSettings(), named))
     nothing: Any = None
     extra = ExtraTopics(Dependencies(nothing, nothing, nothing, nothing, STAMPS), [bags], {})
@@ -230,7 +230,7 @@ def test_topics_of_the_ring_alone_are_in_a_bag_only_if_named(named: tuple[str, .
 
 
 class Listener(Consumer):
-    """Remembers what it was given."""
+    """Records what it receives."""
 
     def __init__(self, choice: TopicChoice | None, *topics: str) -> None:
         self.wanted_topics = choice
@@ -245,7 +245,7 @@ class Listener(Consumer):
 
 
 def test_each_consumer_gets_its_own_topics() -> None:
-    """All share the subscriptions: what a sensor has goes to those without a choice too, anything else to whoever chose it."""
+    """All share the subscriptions: the sensors' topics also reach consumers without a choice, others only those that chose it."""
     choice = TopicChoice(BagSettings(), [])
     sensors_only, chose, chose_not = Listener(None), Listener(choice, TOPIC), Listener(choice, '/other')
     everyone = [chose, sensors_only, chose_not]

@@ -1,4 +1,4 @@
-"""What the ring and the conditions get of what the intake took: the very messages, without a wait and without a copy."""
+"""What the ring and the conditions get from the intake: the same messages, without waiting and without a copy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Graph:
 
 
 class Losses:
-    """EventAccounts of no event: it notes what could not be had."""
+    """EventAccounts without an event: records the messages that are unavailable."""
 
     def __init__(self) -> None:
         self.lost: list[tuple[str, list[int | None]]] = []
@@ -55,7 +55,7 @@ class Losses:
 
 
 class Ear:
-    """The events' consumer over a ring, as the intake has it."""
+    """The events' consumer with a ring, as in the intake."""
 
     def __init__(self, **settings: Any) -> None:
         self.graph: Any = Graph()
@@ -71,7 +71,7 @@ class Ear:
 
 
 def test_events_need_topics_of_the_ring_and_of_conditions() -> None:
-    """Names as the node's namespace makes them; a topic that only a condition looks at is not kept."""
+    """Names as resolved in the node's namespace; a topic used only by a condition is not kept."""
     ear = Ear(topics=('imu',), regex='^/odom', conditions=('low: lowstate:bms_state.soc < 20', 'hot: imu:temperature > 80'))
     assert ear.wanted('/odom', '/other') == {'/r0/imu', '/odom', '/r0/lowstate'}
     for topic in ('/r0/imu', '/odom', '/r0/lowstate'):
@@ -82,7 +82,7 @@ def test_events_need_topics_of_the_ring_and_of_conditions() -> None:
 
 
 def test_the_graph_is_asked_once_for_each_publisher() -> None:
-    """A poll of the intake is not a place for questions."""
+    """A poll of the intake must not query the graph."""
     ear = Ear(topics=('/talk',))
     for _ in range(5):
         ear.take('/talk', messages(range(3)))
@@ -92,7 +92,7 @@ def test_the_graph_is_asked_once_for_each_publisher() -> None:
 
 
 def test_a_pause_keeps_nothing() -> None:
-    """What comes meanwhile is lost to an event that asks for it, by the pause; otherwise it is nobody's loss."""
+    """Messages during it are lost to an event that requests them, because of the pause; otherwise they are not counted."""
     ear = Ear(topics=('/talk',))
     ear.take('/talk', messages(range(3)), paused=True)
     assert (ear.ring.bytes, ear.claims.lost) == (0, [])
@@ -102,7 +102,7 @@ def test_a_pause_keeps_nothing() -> None:
 
 
 def test_event_messages_dropped_from_the_ring_are_reported() -> None:
-    """Only then: without an event the oldest go in silence."""
+    """Only then: without an event the oldest are removed silently."""
     ear = Ear(topics=('/talk',))
     for number in range(20):
         ear.take('/talk', batch(range(number, number + 1), size=100_000).messages)
@@ -117,7 +117,7 @@ def seen(inbox: Inbox) -> list[int | None]:
 
 
 def test_conditions_check_a_sample_of_messages() -> None:
-    """Ten of a drain, evenly, the newest among them; one where a condition holds for a time, or messages are large."""
+    """Ten per drain, evenly, including the newest; one if a condition has a hold time, or messages are large."""
     (now,), (later,) = conditions(['x: /x:data > 1']), conditions(['x: /x:data > 1 for 5'])
     inbox = Inbox([('/x', now)])
     inbox.put('/x', FLOAT, messages(range(100)), 0.0)
@@ -133,7 +133,7 @@ def test_conditions_check_a_sample_of_messages() -> None:
 
 
 def test_the_inbox_is_bounded() -> None:
-    """Nobody may look for a while: the newest stay."""
+    """If it is not drained for a while the newest messages are kept."""
     inbox = Inbox([('/x', conditions(['x: /x:data > 1'])[0])])
     for first in range(0, 1000, 10):
         inbox.put('/x', FLOAT, messages(range(first, first + 10)), 0.0)
@@ -141,7 +141,7 @@ def test_the_inbox_is_bounded() -> None:
 
 
 class Watched:
-    """An event watch with what it triggers."""
+    """An event watch and what it triggers."""
 
     def __init__(self, home: Path, *texts: str, log_event: str = '.*') -> None:
         clock = Clocks()
@@ -164,7 +164,7 @@ def float64(value: float) -> bytes:
 
 
 def test_a_condition_triggers(tmp_path: Path) -> None:
-    """With its name, and the number that it saw."""
+    """With its name, and the observed number."""
     watched = Watched(tmp_path, 'low: /x:data < 20')
     for value in (30.0, 19.5, 18.0):
         watched.say(float64(value))
@@ -177,7 +177,7 @@ def test_a_condition_triggers(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_an_unusable_condition_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, cdr: bytes,
                                          said: str) -> None:  # fmt: skip
-    """A field that is not there, a message that is none."""
+    """A missing field, or an invalid message."""
     watched = Watched(tmp_path, text)
     for _ in range(3):
         watched.say(cdr)
@@ -186,7 +186,7 @@ def test_an_unusable_condition_is_logged_once(tmp_path: Path, caplog: pytest.Log
 
 
 def test_agent_events_match_the_log_event_setting(tmp_path: Path) -> None:
-    """Names that match, of the mission that is active; also what was logged just before it was over."""
+    """Matching names, from the active mission; also those logged just before it ended."""
     watched = Watched(tmp_path, log_event='^f')
     folder = MissionFolder(tmp_path / 'missions' / 'patrol_1')
     folder.path.mkdir(parents=True)

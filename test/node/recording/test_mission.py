@@ -1,4 +1,4 @@
-"""The node's part in a mission: when it begins and ends, what is marked, what is logged."""
+"""The node's part in a mission: its start and end, what is marked, what is logged."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ JPEG = simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8))
 
 
 class Intake:
-    """Does at once what it is told; stands for the sampler as well."""
+    """Runs requests immediately; also acts as the sampler."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
@@ -49,7 +49,7 @@ class Intake:
         return True
 
     def set_idle(self, *, idle: bool) -> None:
-        """The sampler's."""
+        """As the sampler's method."""
         self.asked.append('idle' if idle else 'busy')
 
 
@@ -76,7 +76,7 @@ class Setting:
 
 @pytest.fixture
 def opened() -> Iterator[ExitStack]:
-    """Closes what a test opens."""
+    """Closes everything that a test opens."""
     with ExitStack() as stack:
         yield stack
 
@@ -126,7 +126,7 @@ def thing(t_start_ns: int) -> DataObject:
 
 
 def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitStack) -> None:
-    """With its id, and the run's once it is known; what began before the start is not, and nothing after the end."""
+    """With its id, and the run's once it is known; objects that started before it or follow the end are not."""
     setting, logger = watching(opened, tmp_path)
     assert setting.watch.mark(thing(NOON_NS)).metadata == {'robot': 'thor'}
     mission_id = logger.start_mission('patrol', '')
@@ -151,7 +151,7 @@ def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitSta
 
 
 def test_a_mark_has_the_agents_spelling(tmp_path: Path, opened: ExitStack) -> None:
-    """Whatever the agent calls its mission."""
+    """However the agent spells the name of its mission."""
     setting, logger = watching(opened, tmp_path)
     logger.start_mission('Küche\n\N{DOG FACE}', '')
     until(setting.watch.status, 'the mission is noticed')
@@ -164,7 +164,7 @@ def test_a_mark_has_the_agents_spelling(tmp_path: Path, opened: ExitStack) -> No
     ('capture', 'asked'), [('always', ['flush', 'flush']), ('mission', ['idle', 'flush', 'busy', 'flush', 'idle'])]
 )
 def test_batches_end_where_missions_begin_and_end(tmp_path: Path, opened: ExitStack, capture: str, asked: list[str]) -> None:
-    """No object is of a mission and of another time; with ``capture: mission`` nothing is stored outside of one."""
+    """No object spans a mission and other time; with ``capture: mission`` nothing is stored outside a mission."""
     setting, logger = watching(opened, tmp_path, capture=capture)
     logger.start_mission('patrol', '')
     until(setting.watch.status, 'the mission is noticed')
@@ -174,7 +174,7 @@ def test_batches_end_where_missions_begin_and_end(tmp_path: Path, opened: ExitSt
 
 
 def test_robot_state_is_journaled(tmp_path: Path, opened: ExitStack) -> None:
-    """From start to end, and the journal is let go of then; with ``join: false`` there is none."""
+    """From start to end; then the journal is released; with ``join: false`` there is none."""
     setting, logger = watching(opened, tmp_path)
     logger.start_mission('patrol', '')
     until(setting.watch.status, 'the mission is noticed')
@@ -191,7 +191,7 @@ def test_robot_state_is_journaled(tmp_path: Path, opened: ExitStack) -> None:
 
 
 def test_the_node_joins_a_mission_only_if_configured(tmp_path: Path, opened: ExitStack) -> None:
-    """Without ``join`` objects are marked all the same, and the mission's folder is left alone."""
+    """Without ``join`` objects are still marked, and the mission's folder is not touched."""
     setting, logger = watching(opened, tmp_path, join=False)
     logger.start_mission('patrol', '')
     until(setting.watch.status, 'the mission is noticed')
@@ -204,7 +204,7 @@ def test_the_node_joins_a_mission_only_if_configured(tmp_path: Path, opened: Exi
 
 
 def test_poses_are_read_from_odometry() -> None:
-    """All that is kept of it, with the heading in radians."""
+    """All logged values, with the heading in radians."""
     found = list(new_observer().facts(batch('odom', '/odom', 'nav_msgs/msg/Odometry', odometry(1, 0.5), odometry(1.5, -3.0))))
     assert [pose for pose in found if isinstance(pose, Pose)] == [
         Pose(NOON_NS, 1.0, 2.0, pytest.approx(0.5), 0.3, 'odom'),
@@ -213,7 +213,7 @@ def test_poses_are_read_from_odometry() -> None:
 
 
 def test_a_field_is_read_once_per_period() -> None:
-    """Any number of any type, an array's element as well."""
+    """Any number of any type, including an element of an array."""
     observer = new_observer(battery='joint_states:position.1', temperature='')
     joints = STORE.types['sensor_msgs/msg/JointState']
     empty = np.zeros(0)
@@ -223,7 +223,7 @@ def test_a_field_is_read_once_per_period() -> None:
 
 
 def test_a_missing_field_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    """The mission goes on without it."""
+    """The mission continues without it."""
     observer = new_observer(battery='talk:no.such', temperature='')
     messages = [STORE.types['std_msgs/msg/String']('hi')] * 20
     assert list(observer.facts(batch('talk', '/talk', 'std_msgs/msg/String', *messages))) == []
@@ -233,7 +233,7 @@ def test_a_missing_field_is_logged_once(caplog: pytest.LogCaptureFixture) -> Non
 
 
 def test_a_battery_state_is_logged_in_percent(caplog: pytest.LogCaptureFixture) -> None:
-    """Its ``percentage`` is 0 to 1; one that is not measured is not logged, one beyond is said once."""
+    """Its ``percentage`` is 0 to 1; an unmeasured value is not logged, an invalid one is reported once."""
     observer = new_observer(battery='battery:percentage', temperature='battery:temperature')
     kind, none = STORE.types['sensor_msgs/msg/BatteryState'], np.empty(0, np.float32)
     some = [kind(a_header(), 28.5, 31.0, -2.0, 10.0, 15.0, 15.0, share, 2, 1, 3, True, none, none, '', '')
@@ -247,7 +247,7 @@ def test_a_battery_state_is_logged_in_percent(caplog: pytest.LogCaptureFixture) 
 
 
 def test_a_frame_is_taken_every_few_seconds() -> None:
-    """As the camera published it; other sensors' pictures are none of the mission's."""
+    """As the camera published it; images of other sensors are not part of the mission."""
     observer, kind = new_observer(frame_every_s=5.0), 'sensor_msgs/msg/CompressedImage'
     image = STORE.types[kind](a_header(), 'jpeg', np.frombuffer(JPEG, np.uint8))
     batches = [batch('camera', '/c', kind, image, start_ns=NOON_NS + second * SECOND) for second in range(11)]
@@ -257,7 +257,7 @@ def test_a_frame_is_taken_every_few_seconds() -> None:
 
 
 def test_without_a_camera_sensor_the_first_image_sensor_is_used() -> None:
-    """Those of the first sensor with pictures, until there is a ``camera``."""
+    """The first sensor with images, until there is a ``camera``."""
     settings = given({}, Path('nowhere'))
     camera = next(sensor for sensor in settings.sensors if sensor.name == 'camera')
     shown = dict.fromkeys(('wrist', 'side', 'camera'), camera)
@@ -271,7 +271,7 @@ def test_without_a_camera_sensor_the_first_image_sensor_is_used() -> None:
 
 
 def test_without_odometry_poses_come_from_tf() -> None:
-    """They are those of tf, until there is odometry."""
+    """They come from tf until there is odometry."""
     kind = 'tf2_msgs/msg/TFMessage'
     settings = given({}, Path('nowhere'))
     place = Pose(NOON_NS, 1.0, 2.0, 0.5, 0.1, 'map')
@@ -286,7 +286,7 @@ def test_without_odometry_poses_come_from_tf() -> None:
     ('parameters', 'again'), [({}, 0), ({'camera.format': 'png'}, 1), ({'camera.format': 'zip', 'camera.batch_s': 1.0}, 1)]
 )
 def test_a_raw_frame_is_encoded_once(monkeypatch: pytest.MonkeyPatch, parameters: dict[str, object], again: int) -> None:
-    """The mission has the JPEG that was made for the sensor; it makes one of its own only where the sensor's object is none."""
+    """The mission has the JPEG that was made for the sensor, and encodes one only if the sensor's object is not a JPEG."""
     made: list[int] = []
 
     def counting(*given: Any, **options: Any) -> bytes:
@@ -312,7 +312,7 @@ def test_a_raw_frame_is_encoded_once(monkeypatch: pytest.MonkeyPatch, parameters
 
 @pytest.mark.parametrize(('row_step', 'pad'), [(48, 0), (0, 0), (96, 0), (60, 12)])
 def test_an_organized_cloud_gives_the_floor_plan(row_step: int, pad: int) -> None:
-    """The floor plan has each point of a cloud with several rows where it is, however these are laid out."""
+    """Each point of a cloud with several rows is at its position in the floor plan, with any memory layout."""
     types = STORE.types
     points = np.arange(24, dtype='<f4').reshape(6, 4)
     rows = np.hstack((points.view(np.uint8).reshape(2, -1), np.full((2, pad), 9, np.uint8)))

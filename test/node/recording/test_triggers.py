@@ -1,4 +1,4 @@
-"""Triggers: a condition once for each time that it holds, and agent events while they are recent."""
+"""Triggers: a condition once for each time that it holds, and recent agent events."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def fired(text: str, values: list[float], period_s: float = 1.0) -> list[int]:
-    """The places of the values, a period apart, at which the condition triggered."""
+    """The indices of the values, one period apart, at which the condition triggered."""
     (condition,) = conditions([text])
     judge = ConditionState(condition)
     return [place for place, value in enumerate(values) if judge.poll(value, place * period_s)]
@@ -33,17 +33,17 @@ def fired(text: str, values: list[float], period_s: float = 1.0) -> list[int]:
     ('x: t:f == 1', [0, 1, 1, 0, 0, 1], [1, 5]),
 ], ids=['once', 'again', 'it has to hold', 'a flicker does not arm it', 'armed again', 'equal'])  # fmt: skip
 def test_a_condition_triggers_once_for_each_time_that_it_holds(text: str, values: list[float], places: list[int]) -> None:
-    """It has to hold for its time, and not to hold for as long, a second at least, before it triggers again."""
+    """It must hold for its time, then be false for as long, at least a second, before it triggers again."""
     assert fired(text, values) == places
 
 
 def test_a_noisy_number_triggers_once() -> None:
-    """Without a hold time as well: it is armed again only after a second without it."""
+    """Also without a hold time: it is rearmed only after a second without it."""
     assert fired('x: t:f < 20', [19, 21] * 50, period_s=0.1) == [0]
 
 
 def test_nan_neither_triggers_nor_rearms() -> None:
-    """Neither that the condition holds nor that it does not."""
+    """It means neither that the condition holds nor that it does not."""
     assert fired('x: t:f < 20 for 3', [19, float('nan'), 19, 19]) == [3]
 
 
@@ -63,7 +63,7 @@ def test_the_charge_of_a_battery_state_is_compared_as_the_message_has_it() -> No
 
 
 def test_an_agent_event_triggers_once(tmp_path: Path) -> None:
-    """Only what is new, with its age and data; other records, and what is half written, are not events."""
+    """Only new ones, with age and data; other records, and partially written ones, are not events."""
     journal = Journal(tmp_path / 'journal')
     tail = JournalTail(tmp_path / 'journal')
     assert list(tail.new(NOW_NS)) == []
@@ -81,7 +81,7 @@ def test_an_agent_event_triggers_once(tmp_path: Path) -> None:
 
 
 def test_an_old_agent_event_does_not_trigger(tmp_path: Path) -> None:
-    """A node that starts in the middle of a mission makes no events of its past."""
+    """A node that starts during a mission creates no events from its past."""
     journal = Journal(tmp_path / 'journal')
     journal.create()
     for age_ns in (10 * LATE_NS, LATE_NS // 2):

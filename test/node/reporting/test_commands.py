@@ -1,4 +1,4 @@
-"""The node's answer to each request, with stages that the test controls."""
+"""The node's response to each request, with stages that the test controls."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STAGES = ['intake', 'encode pool', 'spool writer']
 
 
 class Stages:
-    """All stages: ``asked`` is what was asked of them in order, ``stuck`` the one that does not finish."""
+    """All stages: ``asked`` lists the calls in order, ``stuck`` is the stage that does not finish."""
 
     def __init__(self, stuck: str = '', spooled: tuple[int, int] = (0, 0)) -> None:
         self.asked: list[Any] = []
@@ -83,7 +83,7 @@ class Stages:
 
 
 class Writer:
-    """The spool writer among them."""
+    """The spool writer."""
 
     def __init__(self, stages: Stages) -> None:
         self._stages = stages
@@ -96,7 +96,7 @@ class Writer:
 
 
 class Parameters:
-    """One of them."""
+    """A parameter interface."""
 
     def __init__(self) -> None:
         self.values: dict[str, Any] = {'camera.rate_hz': 1.0}
@@ -115,7 +115,7 @@ class Parameters:
 
 
 def ask(commands: Commands, do: str, **arguments: Any) -> tuple[bool, str]:
-    """Whether it was done, and the words."""
+    """Whether it succeeded, and the message."""
     answer = commands.answer({'do': do, **arguments})
     assert answer['robot'] == 'thor'
     return answer['ok'], answer['message' if answer['ok'] else 'error']
@@ -127,7 +127,7 @@ def ask(commands: Commands, do: str, **arguments: Any) -> tuple[bool, str]:
      ((0, 0), '0 objects with 0 messages spooled')],
 )  # fmt: skip
 def test_a_flush_follows_the_data_flow(spooled: tuple[int, int], words: str) -> None:
-    """First the open batches, then the queue, then the disk; the answer says what became durable meanwhile."""
+    """First the open batches, then the queue, then the disk; the response has what became durable in between."""
     stages = Stages(spooled=spooled)
     assert ask(stages.commands(), 'flush') == (True, words)
     assert stages.asked == STAGES
@@ -135,7 +135,7 @@ def test_a_flush_follows_the_data_flow(spooled: tuple[int, int], words: str) -> 
 
 @pytest.mark.parametrize('stuck', STAGES)
 def test_an_incomplete_flush_names_its_stage(stuck: str) -> None:
-    """It is not a success, the stage is named, and those after it are not waited for."""
+    """It is not a success, the stage is named, and later ones are not waited for."""
     stages = Stages(stuck)
     success, words = ask(stages.commands(), 'flush')
     assert (success, stages.asked[-1]) == (False, stuck)
@@ -143,7 +143,7 @@ def test_an_incomplete_flush_names_its_stage(stuck: str) -> None:
 
 
 def test_a_pause_spools_what_is_open() -> None:
-    """What came before the pause is made durable, and the answer tells it; twice is once."""
+    """Messages before the pause are made durable, and the response reports it; pausing twice is the same as once."""
     stages = Stages(spooled=(2, 30))
     commands = stages.commands()
     success, words = ask(commands, 'pause')
@@ -155,7 +155,7 @@ def test_a_pause_spools_what_is_open() -> None:
 
 
 def test_a_pause_on_a_slow_disk_is_a_pause() -> None:
-    """It is in force once the intake has it, and the answer says what is not durable yet."""
+    """It is active once the intake has applied it, and the response has what is not durable yet."""
     stages = Stages('spool writer')
     success, words = ask(stages.commands(), 'pause')
     assert (success, stages.paused) == (True, True)
@@ -164,7 +164,7 @@ def test_a_pause_on_a_slow_disk_is_a_pause() -> None:
 
 @pytest.mark.parametrize('paused', [True, False])
 def test_a_hung_intake_neither_pauses_nor_resumes(*, paused: bool) -> None:
-    """It is not a success, and the state stays what it was."""
+    """It is not a success, and the state is unchanged."""
     stages = Stages('pause' if paused else 'resume')
     stages.paused = not paused
     success, words = ask(stages.commands(), 'pause' if paused else 'resume')
@@ -173,7 +173,7 @@ def test_a_hung_intake_neither_pauses_nor_resumes(*, paused: bool) -> None:
 
 
 def test_a_pause_ends() -> None:
-    """Messages are stored again, without another flush; ending none is not a failure."""
+    """Messages are stored again, without another flush; resuming without a pause is not a failure."""
     stages = Stages()
     stages.paused = True
     commands = stages.commands()
@@ -183,7 +183,7 @@ def test_a_pause_ends() -> None:
 
 
 def test_a_failing_source_does_not_stop_the_others() -> None:
-    """All steps of a round are done in their order, and the failure is raised in the end."""
+    """All steps of a round run in order, and the failure is raised at the end."""
     done: list[int] = []
 
     def step(number: int) -> None:
@@ -197,7 +197,7 @@ def test_a_failing_source_does_not_stop_the_others() -> None:
 
 
 def test_each_service_has_a_command() -> None:
-    """No service is answered by an error about its own request."""
+    """No service responds with an error about its own request."""
     commands = Stages().commands()
     known = commands.answer({'do': 'describe'})['commands']
     requests = [*TRIGGERS.values(), *(request for pair in SWITCHES.values() for request in pair)]
@@ -229,7 +229,7 @@ def test_each_service_has_a_command() -> None:
     ],
 )
 def test_an_impossible_request_is_answered(request_: Mapping[str, Any], words: str) -> None:
-    """It says what is wrong in few words, and nothing was done."""
+    """It gives a brief reason, and nothing is done."""
     stages = Stages()
     answer = stages.commands().answer(request_)
     assert (answer['ok'], answer['robot'], stages.asked) == (False, 'thor', [])
@@ -238,14 +238,14 @@ def test_an_impossible_request_is_answered(request_: Mapping[str, Any], words: s
 
 
 def test_a_defect_in_a_command_is_answered(caplog: pytest.LogCaptureFixture) -> None:
-    """The node goes on; the log has the traceback."""
+    """The node continues; the log has the traceback."""
     done, words = ask(Stages().commands(), 'bag split')
     assert (done, words) == (False, 'it failed because of a bug in this program: OSError: the disk burns')
     assert caplog.records[-1].exc_info
 
 
 def test_an_event_has_a_name_and_a_note() -> None:
-    """Both go into its manifest, and by whom it was asked for; a service's has neither."""
+    """Both are in its manifest, with the requester; an event from a service has neither."""
     stages = Stages()
     commands = stages.commands()
     assert ask(commands, 'event', name='fall', note='on the stairs') == (True, 'event_1 begins')
@@ -254,7 +254,7 @@ def test_an_event_has_a_name_and_a_note() -> None:
 
 
 def test_read_only_commands() -> None:
-    """Parameters, the mission that is active, the last status, and itself."""
+    """Parameters, the active mission, the last status, and itself."""
     stages = Stages()
     commands = stages.commands()
     stages.latest = NodeStatus(robot='thor')
@@ -267,7 +267,7 @@ def test_read_only_commands() -> None:
 
 
 def test_commands_that_change_something_are_logged(caplog: pytest.LogCaptureFixture) -> None:
-    """A failure as a warning; what only tells something is not."""
+    """A failure is a warning; read-only commands are not logged."""
     caplog.set_level(logging.INFO)
     commands = Stages().commands()
     for do in ('flush', 'bag stop', 'parameters', 'describe', 'mission'):
@@ -279,7 +279,7 @@ def test_commands_that_change_something_are_logged(caplog: pytest.LogCaptureFixt
 
 
 def test_named_requests_are_recorded() -> None:
-    """With the node's answer, whatever it was; not what nobody's name is given with."""
+    """With the node's response, whatever it was; requests without a name are not."""
     stages = Stages()
     commands = stages.commands()
     for do in ('bag start', 'bag stop', 'bag split', 'event', 'nothing'):
@@ -294,7 +294,7 @@ def test_named_requests_are_recorded() -> None:
 
 
 def test_the_requester_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    """Also where a success is worth no line otherwise, and goes on to the event; whatever is in the name, it stays one line."""
+    """Also if a success is not logged otherwise, and it is passed on to the event; with any content it stays one line."""
     caplog.set_level(logging.INFO)
     stages = Stages()
     assert ask(stages.commands(), 'event', name='fall', by='page', who='operator at 10.0.0.7') == (True, 'event_1 begins')
@@ -307,7 +307,7 @@ def test_the_requester_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_uploads_yield_for_some_seconds(caplog: pytest.LogCaptureFixture) -> None:
-    """Whoever asks asks again; that is no line in the log each time."""
+    """The client repeats its request; not every repeat is logged."""
     caplog.set_level(logging.INFO)
     stages = Stages()
     assert ask(stages.commands(), 'yield', max_mbps=2.0) == (True, 'uploads send at most 2 Mbit/s for 5 s')
@@ -320,7 +320,7 @@ def test_uploads_yield_for_some_seconds(caplog: pytest.LogCaptureFixture) -> Non
 
 
 def test_a_pull_requests_kept_data() -> None:
-    """The answer has the id of the request; what nobody can ask for is refused, and where nothing is kept all is."""
+    """The response has the id of the request; invalid requests are refused, and all are if nothing is kept."""
     stages = Stages()
     assert ask(stages.commands(), 'pull', want={'sensor': 'camera'}) == (
         False, 'no data is kept here: ship of all sensors and of bag is always'

@@ -1,4 +1,4 @@
-"""The control socket: who may use it, what it bounds, and that no client can hurt the node or another client."""
+"""The control socket: who may use it, its limits, and that no client can harm the node or another client."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHORT_S = 0.2
 
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Callable[..., Serving]]:
-    """Makes sockets, and closes them in the end."""
+    """Creates sockets, and closes them at the end."""
     made: list[Serving] = []
 
     def make(spool: Path = tmp_path / 'spool', **given: Any) -> Serving:
@@ -42,7 +42,7 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Serving]]:
 
 
 def raw(serving: Serving, name: str = 'control.sock') -> socket.socket:
-    """A client that sends what it likes."""
+    """A client that sends raw bytes."""
     client = socket.socket(socket.AF_UNIX)
     client.settimeout(WAIT_S)
     with address(serving.spool, name) as there:
@@ -51,7 +51,7 @@ def raw(serving: Serving, name: str = 'control.sock') -> socket.socket:
 
 
 def heard(client: socket.socket) -> list[dict[str, Any]]:
-    """All that the node says until it hangs up."""
+    """Everything that the node sends until it closes the connection."""
     said = b''
     with suppress(ConnectionResetError):
         while more := client.recv(1 << 16):
@@ -60,7 +60,7 @@ def heard(client: socket.socket) -> list[dict[str, Any]]:
 
 
 def works(serving: Serving) -> bool:
-    """Whether somebody else is served."""
+    """Whether another client is served."""
     with closing(Connection(serving.spool, 'control.sock', WAIT_S)) as connection:
         return bool(connection.ask('flush')['message'] == 'flush is done')
 
@@ -73,7 +73,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def test_a_request_is_done_and_answered(serve: Callable[..., Serving]) -> None:
-    """One after the other on one connection, with what is given along; long answers come whole."""
+    """One after the other on one connection, with arguments; long responses arrive complete."""
     serving = serve()
     with closing(connect(serving.spool)) as connection:
         assert connection.ask('flush') == {'ok': True, 'robot': 'thor', 'message': 'flush is done', 'long': ''}
@@ -83,7 +83,7 @@ def test_a_request_is_done_and_answered(serve: Callable[..., Serving]) -> None:
 
 @pytest.mark.parametrize('umask', [0o000, 0o077])
 def test_the_socket_is_for_its_owner_alone(serve: Callable[..., Serving], umask: int) -> None:
-    """Whatever the umask; nothing of its making is left beside it, and nothing of it after its end."""
+    """With any umask; no temporary file is left next to it, and nothing after its end."""
     before = os.umask(umask)
     try:
         serving = serve()
@@ -102,7 +102,7 @@ def test_the_socket_is_for_its_owner_alone(serve: Callable[..., Serving], umask:
     ('mode', 'said'), [(0o600, 'this user may not use control.sock (run this as the user of the node)'), (0o666, 'thor')]
 )
 def test_another_user_is_refused(serve: Callable[..., Serving], mode: int, said: str) -> None:
-    """By the mode of the socket, where that of its folder keeps nobody away; the error says whom to ask as."""
+    """By the mode of the socket, also in an accessible folder; the error names the user to run as."""
     serving = serve()
     serving.spool.chmod(0o755)
     (serving.spool / 'control.sock').chmod(mode)
@@ -132,7 +132,7 @@ except NodeUnavailable as error:
     ids=lambda line: repr(line[:16]),
 )  # fmt: skip
 def test_an_invalid_request_gets_an_error(serve: Callable[..., Serving], line: bytes) -> None:
-    """Nothing is done, and the next line of the same client is."""
+    """Nothing is done, and the next line of the same client is handled."""
     serving = serve()
     with raw(serving) as client:
         client.sendall(line + b'\n{"do": "flush"}\n')
@@ -146,7 +146,7 @@ def test_an_invalid_request_gets_an_error(serve: Callable[..., Serving], line: b
 
 @pytest.mark.parametrize('content', [b'{"do": "' + b'x' * 10_000_000 + b'"}\n', os.urandom(10_000_000).replace(b'\n', b'\r')])
 def test_a_line_has_a_maximum_length(serve: Callable[..., Serving], content: bytes) -> None:
-    """Ten megabytes, or what never ends, are refused as soon as they are too long, and the client is left."""
+    """Ten megabytes, or an endless line, are refused as soon as they are too long, and the client is disconnected."""
     serving = serve()
     with raw(serving) as client:
         with pytest.raises((BrokenPipeError, ConnectionResetError)):
@@ -158,7 +158,7 @@ def test_a_line_has_a_maximum_length(serve: Callable[..., Serving], content: byt
 
 
 def test_a_line_of_maximum_length_is_accepted(serve: Callable[..., Serving]) -> None:
-    """The bound is the one that is told."""
+    """The limit is the documented one."""
     serving = serve()
     line = b'{"do": "tell"' + b' ' * (MAX_REQUEST_BYTES - 14) + b'}\n'
     with raw(serving) as client:
@@ -169,7 +169,7 @@ def test_a_line_of_maximum_length_is_accepted(serve: Callable[..., Serving]) -> 
 
 
 def test_an_incomplete_line_is_not_a_request(serve: Callable[..., Serving]) -> None:
-    """Whoever hangs up in the middle of a request has asked for nothing."""
+    """A client that disconnects in the middle of a request has requested nothing."""
     serving = serve()
     with raw(serving) as client:
         client.sendall(b'{"do": "flush"}')
@@ -181,7 +181,7 @@ def test_an_incomplete_line_is_not_a_request(serve: Callable[..., Serving]) -> N
 
 @pytest.mark.parametrize('drips', [False, True])
 def test_a_client_must_send_a_line(serve: Callable[..., Serving], drips: bool) -> None:
-    """One that says nothing, or a letter now and then, is left after a while."""
+    """One that sends nothing, or a byte now and then, is disconnected after a while."""
     serving = serve(idle_s=SHORT_S)
     with raw(serving) as client:
         if drips:
@@ -195,7 +195,7 @@ def test_a_client_must_send_a_line(serve: Callable[..., Serving], drips: bool) -
 
 
 def test_a_client_must_read_its_answer(serve: Callable[..., Serving]) -> None:
-    """One that does not is left after a while; others are served meanwhile, and no answer of it stays in memory."""
+    """One that does not is disconnected after a while; others are served during that time, and its response is freed."""
     serving = serve(read_s=SHORT_S)
     with raw(serving) as client:
         client.sendall(b'{"do": "tell", "long": 9000000}\n')
@@ -206,7 +206,7 @@ def test_a_client_must_read_its_answer(serve: Callable[..., Serving]) -> None:
 
 
 def test_the_number_of_clients_is_limited(serve: Callable[..., Serving]) -> None:
-    """Of a hundred all the others are told at once, and there is room again when some have gone."""
+    """Of a hundred the excess ones are refused immediately, and there is room again when some have disconnected."""
     serving = serve()
     clients = [raw(serving) for _ in range(100)]
     for client in clients:
@@ -224,7 +224,7 @@ def test_the_number_of_clients_is_limited(serve: Callable[..., Serving]) -> None
 
 
 def test_an_answer_has_a_deadline(serve: Callable[..., Serving]) -> None:
-    """Whoever asks while the node hangs is told, and what was not begun by then is not done any more."""
+    """A client gets an error while the node hangs, and requests not started by then are not executed."""
     serving = serve(answer_s=SHORT_S)
     with serving.hold, closing(Connection(serving.spool, 'control.sock', WAIT_S)) as connection:
         answer = connection.ask('flush')
@@ -235,7 +235,7 @@ def test_an_answer_has_a_deadline(serve: Callable[..., Serving]) -> None:
 
 
 def test_clients_are_notified_on_close(serve: Callable[..., Serving]) -> None:
-    """Those that wait for an answer, and those that do not; nobody waits for a node that is no more."""
+    """Those waiting for a response, and the others; no client waits for a node that has stopped."""
     serving = serve()
     with serving.hold, raw(serving) as waits, raw(serving) as idles:
         waits.sendall(b'{"do": "flush"}\n')
@@ -250,7 +250,7 @@ def test_clients_are_notified_on_close(serve: Callable[..., Serving]) -> None:
 
 
 def test_the_socket_can_be_closed_during_an_answer(serve: Callable[..., Serving], caplog: pytest.LogCaptureFixture) -> None:
-    """Also where the answer and the end come together."""
+    """Also if the response and the close coincide."""
     serving = serve()
     gate, client = threading.Event(), raw(serving)
     with closing(client):
@@ -269,7 +269,7 @@ def test_the_socket_can_be_closed_during_an_answer(serve: Callable[..., Serving]
 
 
 def test_a_killed_node_is_detected(tmp_path: Path) -> None:
-    """A client whose node goes away in the middle of an answer is told so."""
+    """A client gets an error if its node is killed during a response."""
     with socket.socket(socket.AF_UNIX) as listener:
         with address(tmp_path, 'control.sock') as there:
             listener.bind(there)
@@ -290,7 +290,7 @@ def test_a_killed_node_is_detected(tmp_path: Path) -> None:
 
 
 def test_an_endless_answer_is_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever listens there cannot fill the memory of a client."""
+    """A faulty server cannot fill the memory of a client."""
     monkeypatch.setattr(control, 'MAX_ANSWER_BYTES', 1 << 16)
     with socket.socket(socket.AF_UNIX) as listener:
         with address(tmp_path, 'control.sock') as there:
@@ -305,7 +305,7 @@ def test_an_endless_answer_is_abandoned(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_the_socket_of_a_killed_node_is_replaced(serve: Callable[..., Serving], tmp_path: Path) -> None:
-    """A socket that nobody listens on, and one that was never finished."""
+    """A socket without a listener, and one that was not completely set up."""
     spool = tmp_path / 'spool'
     spool.mkdir(mode=0o700)
     for name in ('control.sock', 'control.sock.part', 'control-thor.sock'):
@@ -319,7 +319,7 @@ def test_the_socket_of_a_killed_node_is_replaced(serve: Callable[..., Serving], 
 
 
 def test_several_nodes_of_one_spool_have_separate_sockets(serve: Callable[..., Serving]) -> None:
-    """The first has the socket's usual name, each other one its robot's; clients find them by their robots."""
+    """The first has the usual name of the socket, each other one its robot's; clients find them by robot."""
     first, second = serve(robot='thor'), serve(robot='tachi')
     assert sorted(path.name for path in first.spool.glob('*.sock')) == ['control-tachi.sock', 'control.sock']
     with closing(connect(first.spool, 'thor')) as thor, closing(connect(first.spool, 'tachi')) as tachi:
@@ -337,7 +337,7 @@ def test_several_nodes_of_one_spool_have_separate_sockets(serve: Callable[..., S
 
 
 def test_the_path_of_the_spool_may_be_long(serve: Callable[..., Serving], tmp_path: Path) -> None:
-    """Longer than the address of a socket (107 bytes)."""
+    """Longer than the maximum address of a socket (107 bytes)."""
     spool = tmp_path.joinpath(*['a' * 100] * 5) / 'spool'
     serving = serve(spool)
     assert works(serving)
@@ -346,7 +346,7 @@ def test_the_path_of_the_spool_may_be_long(serve: Callable[..., Serving], tmp_pa
 
 def test_a_socket_that_cannot_be_created_is_tried_again(serve: Callable[..., Serving], tmp_path: Path,
                                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """The thread fails, which is told as that of any other; once it can be made the socket is there."""
+    """The thread fails, which is reported as for any other; the socket is created once that is possible."""
     may = threading.Event()
     replace = os.replace
 

@@ -1,4 +1,4 @@
-"""Which level each state of the node has on ``/diagnostics``, and in which words."""
+"""The level and message on ``/diagnostics`` for each state of the node."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ STATUS: dict[str, Any] = {
 
 
 def changed(**values: Any) -> NodeStatus:
-    """The status with other values: ``section__name``, or of the one topic ``topic__name``."""
+    """The status with other values: ``section__name``, or ``topic__name`` for the only topic."""
     status = deepcopy(STATUS)
     for name, value in values.items():
         section, _, key = name.partition('__')
@@ -56,13 +56,13 @@ LATE = {'publisher': 'p', 'state': 'offset', 'offset_s': 146.0, 'spread_s': 0.1,
 
 
 def told(name: str, **values: Any) -> tuple[Any, str]:
-    """Level and words of an entry, after a while in which everything was fine."""
+    """Level and message of an entry, after a while without problems."""
     found = {entry[0]: entry for entry in entries(changed(**values), changed())}
     return found[name][1], found[name][2]
 
 
 def test_undiscovered_publishers_are_an_error() -> None:
-    """Say so at their topic, which has an entry of its own then whether anything was heard of it or not."""
+    """They are reported for their topic, which has an entry then, whether or not any message was received."""
     undiscovered = {
         topic: {'publishers': 1, 'nodes': [], 'seconds': 40, 'text': f'{topic} is not all heard'} for topic in ('/imu', '/odom')
     }
@@ -71,7 +71,7 @@ def test_undiscovered_publishers_are_an_error() -> None:
 
 
 def test_a_healthy_node_is_ok() -> None:
-    """There is an entry for each topic, the bag, events, spool, store, clock, workers and the node; old losses are told once."""
+    """Each topic, the bag, events, spool, store, clock, workers and the node have an entry; old losses are reported once."""
     found = list(entries(changed(), changed()))
     assert [entry[0] for entry in found] == ['node', '/imu', 'bag', 'events', 'spool', 'store', 'clock', 'workers']
     assert {entry[1] for entry in found} == {OK}
@@ -100,7 +100,7 @@ def test_a_healthy_node_is_ok() -> None:
     ],
 )  # fmt: skip
 def test_the_state_of_a_topic_has_its_level(values: dict[str, Any], level: Any, words: str) -> None:
-    """Losses since a moment ago and silence need a look; one that nobody publishes is stale, one that is off is fine."""
+    """Recent losses and silence are a warning; a topic without a publisher is stale, a disabled one is OK."""
     assert told('/imu', **values) == (level, words)
 
 
@@ -143,14 +143,14 @@ def test_the_state_of_a_topic_has_its_level(values: dict[str, Any], level: Any, 
     ],
 )  # fmt: skip
 def test_every_other_part_has_its_level(name: str, values: dict[str, Any], level: Any, words: str) -> None:
-    """A store that is away and a spool that fills up need a look; refused credentials, quarantine and defects need a hand."""
+    """An unreachable store and a spool filling up are warnings; refused credentials, quarantine and defects are errors."""
     found = told(name, **values)
     assert found[0] == level
     assert words in found[1]
 
 
 def test_every_figure_fits_its_message() -> None:
-    """What rclpy refuses in a message would end the node: levels are bytes, values text, and what is unknown is empty."""
+    """A value that rclpy refuses would end the node: levels are bytes, values text, and unknown values are empty."""
     for name, level, text, figures in entries(changed(store__blocked_buckets={'b': 'why'}), changed()):
         values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
         message = DiagnosticStatus(name=name, level=bytes([level]), message=text, values=values)

@@ -1,4 +1,4 @@
-"""The status of the node, from stages that report what the test gives them."""
+"""The status of the node, from stages controlled by the test."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from shadowhound_data_logger.spool.status import file, read
 
 
 class Sampler:
-    """A consumer that failed."""
+    """A failed consumer."""
 
     failures, last_error = 2, 'ValueError: x'
 
 
 class Intake:
-    """Listens to one topic; ``sources`` is what it says of that."""
+    """Subscribes to one topic; ``sources`` is what it reports about it."""
 
     def __init__(self) -> None:
         self.paused = False
@@ -49,7 +49,7 @@ class Intake:
 
 
 class Threads:
-    """An encode pool or a spool writer: all that is asked of them are their threads."""
+    """An encode pool or a spool writer: only their threads are used."""
 
     def __init__(self, *names: str) -> None:
         self.workers = [Worker(name, lambda: None) for name in names]
@@ -57,21 +57,21 @@ class Threads:
 
 
 class Missions(Threads):
-    """None is active."""
+    """No active mission."""
 
     def status(self) -> MissionStatus:
         return MissionStatus()
 
 
 class Recorders(Threads):
-    """Records nothing."""
+    """No recording."""
 
     def status(self) -> BagStatus:
         return BagStatus()
 
 
 class EventBuffers(Threads):
-    """Keeps nothing."""
+    """An empty event buffer."""
 
     consumers = ()
 
@@ -84,7 +84,7 @@ class EventBuffers(Threads):
 
 
 class Uploader:
-    """Delivers as much as it is told."""
+    """Delivers as much as the test sets."""
 
     def __init__(self) -> None:
         self.told = UploadStatus('idle', '', 5, 0, 0, 0, 0)
@@ -95,7 +95,7 @@ class Uploader:
 
 
 class Setting:
-    """A status over an open spool, at a time that the test owns."""
+    """A status for an open spool, with a clock controlled by the test."""
 
     def __init__(self, folder: Path) -> None:
         self.now_s = 100.0
@@ -120,7 +120,7 @@ class Setting:
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
     def poll(self, seconds: float = 1.0) -> NodeStatus:
-        """So much later."""
+        """Poll after this time."""
         self.now_s += seconds
         self.clock.now_ns += round(seconds * 1e9)
         found = self.status.poll()
@@ -142,7 +142,7 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
 
 
 def test_a_topic_before_and_after_its_first_message(setting: Setting) -> None:
-    """It is listed from the start; its age and whether anything was missed are unknown until something came."""
+    """It is listed from the start; its age and its missed messages are unknown until a message arrives."""
     row = setting.poll().topics['/imu']
     assert (row.sensor, row.publishers, row.received, row.age_s, row.missed) == ('imu', 1, 0, None, None)
     setting.receive(50)
@@ -151,7 +151,7 @@ def test_a_topic_before_and_after_its_first_message(setting: Setting) -> None:
 
 
 def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
-    """Messages and sent bytes a second, over some seconds; what was long ago does not count."""
+    """Messages and sent bytes per second, averaged over some seconds; older ones do not count."""
     total = 0
     for second in range(20):
         setting.receive(100 if second < 10 else 10, total)
@@ -165,7 +165,7 @@ def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
 
 
 def test_the_status_has_the_state_of_the_spool(setting: Setting) -> None:
-    """Objects and bytes that wait, for how long, and the room there is."""
+    """Pending objects and bytes, their age, and the free space."""
     put(setting.spool, make('thor/a.jpg', b'12345'), make('thor/b.jpg', b'123', held='clock'))
     spool = setting.poll(3.0).spool
     assert (spool.pending, spool.held, spool.bytes, spool.oldest_age_s) == (1, 1, 8, 3.0)
@@ -174,7 +174,7 @@ def test_the_status_has_the_state_of_the_spool(setting: Setting) -> None:
 
 
 def test_a_failing_worker_is_reported(setting: Setting) -> None:
-    """Each thread has its row: whether it lives and fails, how often it failed and died, and why."""
+    """Each thread has a row: whether it is alive and fails, how often it failed and crashed, and why."""
     worker = setting.intake.worker
     worker.failing, worker.last_error, worker.failures, worker.deaths = True, 'ValueError: x', 3, 1
     workers = setting.poll().workers
@@ -184,14 +184,14 @@ def test_a_failing_worker_is_reported(setting: Setting) -> None:
 
 
 def test_a_stall_is_reported(setting: Setting) -> None:
-    """What the watchdog finds stands in the status: here a batch that nobody takes from the queue."""
+    """Findings of the watchdog are in the status: here a batch that is not taken from the queue."""
     setting.queue.put(Batch('imu', '/imu', 't', (Sample(1, b''),), 1), 5)
     assert setting.poll().stalls == {}
     assert 'no batch was encoded for 11 s' in setting.poll(11.0).stalls['encode']
 
 
 def test_the_reader_finds_what_was_written(setting: Setting, tmp_path: Path) -> None:
-    """The command line's reader sees a running node, with every figure, and after the last one that it has ended."""
+    """The command line's reader finds a running node, with every value, and after the last status that it has stopped."""
     setting.receive(7)
     written = setting.poll()
     setting.status.write(written)
@@ -208,7 +208,7 @@ def test_the_reader_finds_what_was_written(setting: Setting, tmp_path: Path) -> 
 
 
 def test_a_write_error_is_logged_once(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
-    """A status that cannot be written costs a line in the log, not the node."""
+    """A status that cannot be written is logged once, and does not stop the node."""
     blocked = file(setting.spool.root, 'thor').with_name('status-thor.json.part')
     blocked.mkdir()
     with caplog.at_level(logging.WARNING):
@@ -219,7 +219,7 @@ def test_a_write_error_is_logged_once(setting: Setting, caplog: pytest.LogCaptur
 
 
 def test_an_unreadable_spool_is_logged_once(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
-    """Then there is no status, and what was written before stays, growing old."""
+    """Then no status is written, and the previous one remains, with increasing age."""
     setting.spool.usage = broken  # type: ignore[method-assign]
     with caplog.at_level(logging.WARNING):
         assert setting.status.poll() is None

@@ -27,7 +27,7 @@ STATUS: dict[str, Any] = {
 
 
 class Watch:
-    """A watchdog, the status it looks at, and the time."""
+    """A watchdog, the status it checks, and the time."""
 
     def __init__(self) -> None:
         self.status = deepcopy(STATUS)
@@ -38,20 +38,20 @@ class Watch:
         self.heard_s: float | None = None
 
     def poll(self, seconds: float = 1.0) -> dict[str, str]:
-        """So much later."""
+        """Poll after this time."""
         self.now_s += seconds
         self.imu['age_s'] = None if self.heard_s is None else self.now_s - self.heard_s
         return dict(self.dog.poll(parse(NodeStatus, self.status), self.now_s))
 
     def observe(self, messages: int = 1, times: int = 1, every_s: float = 1.0) -> None:
-        """So many messages before each of so many looks."""
+        """This many messages before each of this many polls."""
         for _ in range(times):
             self.imu['received'] += messages
             self.heard_s = self.now_s + every_s
             assert self.poll(every_s) == {}
 
     def wait(self, seconds: int) -> dict[str, str]:
-        """Look once a second; nothing may be found before the last look."""
+        """Poll once per second; nothing may be found before the last poll."""
         for _ in range(seconds - 1):
             assert self.poll() == {}
         return self.poll()
@@ -66,13 +66,13 @@ def watch() -> Watch:
 
 @pytest.fixture
 def stages(watch: Watch) -> Watch:
-    """Without a topic that could be missed."""
+    """Without a topic that can stall."""
     watch.imu['publishers'] = 0
     return watch
 
 
 def test_a_topic_that_stops_while_its_publisher_runs_is_reported(watch: Watch, caplog: pytest.LogCaptureFixture) -> None:
-    """Told after five seconds, with its rate and the cause, once; and when it goes on, that too."""
+    """After five seconds, with its rate and the cause, once; and again when it resumes."""
     caplog.set_level(logging.INFO)
     watch.observe(100, times=20)
     found = watch.wait(6)
@@ -84,20 +84,20 @@ def test_a_topic_that_stops_while_its_publisher_runs_is_reported(watch: Watch, c
 
 
 def test_a_slow_topic_is_given_its_time(watch: Watch) -> None:
-    """Ten of its own periods: one that comes every three seconds is not missed for half a minute."""
+    """Ten of its periods: one with a message every three seconds may be silent for half a minute."""
     watch.observe(times=12, every_s=3.0)
     assert '/imu' in watch.wait(31)
 
 
 def test_a_lost_connection_is_a_separate_cause(watch: Watch) -> None:
-    """The publisher is in the graph, the subscription is matched with none."""
+    """The publisher is in the graph, but the subscription has no match."""
     watch.observe(times=20)
     watch.imu['matched'] = 0
     assert 'check the network' in watch.wait(11)['/imu']
 
 
 def test_topics_without_a_rhythm_are_never_missed(watch: Watch) -> None:
-    """A latched map that came once, a button, a burst at the start: nobody knows when the next one is due."""
+    """A single latched map, a button, a burst at the start: it is unknown when the next message is due."""
     watch.observe()
     assert watch.wait(600) == {}
     watch.observe(7)
@@ -107,7 +107,7 @@ def test_topics_without_a_rhythm_are_never_missed(watch: Watch) -> None:
 
 
 def test_topics_that_may_be_silent_are_not_missed(watch: Watch) -> None:
-    """Those kept on change and those that are latched, whether they came evenly before or never came."""
+    """Those kept on change and latched ones, whether they were regular before or never arrived."""
     watch.imu['may_be_silent'] = True
     assert watch.wait(100) == {}
     watch.observe(times=30)
@@ -115,7 +115,7 @@ def test_topics_that_may_be_silent_are_not_missed(watch: Watch) -> None:
 
 
 def test_a_publisher_that_left_is_not_missed(watch: Watch) -> None:
-    """That nobody publishes it any more is told as such; a new publisher begins a new rhythm."""
+    """That the topic has no publisher is reported elsewhere; a new publisher starts a new rhythm."""
     watch.observe(times=20)
     watch.imu['publishers'] = watch.imu['matched'] = 0
     assert watch.wait(60) == {}
@@ -127,19 +127,19 @@ def test_a_publisher_that_left_is_not_missed(watch: Watch) -> None:
 
 @pytest.mark.parametrize('may_be_silent', [True, False])
 def test_a_publisher_without_a_connection_is_reported(watch: Watch, *, may_be_silent: bool) -> None:
-    """Type, QoS or firewall: that is told of every topic, for nothing can come."""
+    """Type, QoS or firewall: this is reported for every topic, since no message can arrive."""
     watch.imu |= {'matched': 0, 'may_be_silent': may_be_silent}
     assert 'ros2 topic info -v /imu' in watch.wait(11)['/imu']
 
 
 def test_a_topic_that_cannot_be_subscribed_to_is_reported(watch: Watch) -> None:
-    """Told at once, with the package that is missing."""
+    """Immediately, with the missing package."""
     watch.imu |= {'matched': 0, 'unavailable': 'its message package is not installed here (x)'}
     assert watch.poll() == {'/imu': 'it cannot be subscribed to here: its message package is not installed here (x)'}
 
 
 def test_a_topic_that_is_off_is_not_missed(watch: Watch) -> None:
-    """Nor when it is switched on again: what it did before does not count."""
+    """Nor when it is enabled again: its earlier rhythm does not count."""
     watch.observe(100, times=20)
     watch.imu['enabled'] = False
     assert watch.wait(60) == {}
@@ -149,7 +149,7 @@ def test_a_topic_that_is_off_is_not_missed(watch: Watch) -> None:
 
 @pytest.mark.parametrize('trouble', [{'busy_s': 6.0}, {'failing': True}])
 def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: dict[str, Any]) -> None:
-    """Then all topics seem to be silent, and none of them is at fault."""
+    """Then all topics seem silent, and none of them is the cause."""
     watch.observe(100, times=20)
     watch.workers['intake'] |= trouble
     for _ in range(20):
@@ -163,7 +163,7 @@ def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: di
      ('event-writer', 31.0, 'nothing more is written to its bag for 31 s')],
 )  # fmt: skip
 def test_a_hung_thread_is_reported(stages: Watch, name: str, busy_s: float, words: str) -> None:
-    """Each thread has its own patience; for the one that holds the drain lock any length is fine."""
+    """Each thread has a separate timeout; the one that holds the drain lock has none."""
     stages.workers['upload-lock']['busy_s'] = 1e6
     stages.workers[name]['busy_s'] = busy_s - 1.1
     assert stages.poll() == {}
@@ -174,7 +174,7 @@ def test_a_hung_thread_is_reported(stages: Watch, name: str, busy_s: float, word
 
 
 def test_a_pool_that_encodes_nothing_is_reported(stages: Watch) -> None:
-    """Batches wait and none is finished; a full queue that moves is none."""
+    """Batches are queued and none is finished; a full queue that moves is not reported."""
     stages.queue['batches'] = 7
     for number in range(30):
         stages.queue['finished'] = number
@@ -195,7 +195,7 @@ def test_a_pool_that_encodes_nothing_is_reported(stages: Watch) -> None:
     ],
 )
 def test_an_upload_that_stalls_is_reported(stages: Watch, store: dict[str, Any], words: str) -> None:
-    """Objects wait, the store is not known to be away, and for longer than a request can take no byte is sent."""
+    """Objects are pending, the store is not known to be unreachable, and no byte is sent for longer than a request may take."""
     stages.store |= store
     stages.status['spool']['pending'] = 9
     assert '9 objects wait and nothing was sent for 66 s: ' in (text := stages.wait(66)['delivery'])
@@ -209,7 +209,7 @@ def test_an_upload_that_stalls_is_reported(stages: Watch, store: dict[str, Any],
     [{'state': 'store_down'}, {'state': 'paused'}, {'state': 'not_draining'}, {'state': 'shipping', 'mbps': 0.001}],
 )  # fmt: skip
 def test_an_upload_with_a_reason_to_wait_is_not_reported(stages: Watch, store: dict[str, Any]) -> None:
-    """A store that is away tells so itself, and a slow one is none that stands still."""
+    """An unreachable store is reported separately, and a slow one has not stalled."""
     stages.store |= store
     stages.status['spool']['pending'] = 9
     assert stages.wait(200) == {}
@@ -217,7 +217,7 @@ def test_an_upload_with_a_reason_to_wait_is_not_reported(stages: Watch, store: d
 
 @pytest.mark.parametrize('trouble', [{'failing': True}, {'busy_s': 100.0}])
 def test_a_disk_that_fails_is_the_one_cause(stages: Watch, trouble: dict[str, Any]) -> None:
-    """Encoders and delivery wait for the spool writer then; only the writer is told."""
+    """Encoders and delivery wait for the spool writer then; only the writer is reported."""
     stages.queue['batches'] = stages.status['spool']['pending'] = 9
     stages.workers['encode-0']['busy_s'] = 100.0
     stages.workers['spool-writer'] |= trouble
@@ -227,5 +227,5 @@ def test_a_disk_that_fails_is_the_one_cause(stages: Watch, trouble: dict[str, An
 
 @pytest.mark.parametrize(('idle_s', 'patience_s'), [(events.IDLE_S, events.PATIENCE_S), (recorder.IDLE_S, recorder.PATIENCE_S)])
 def test_a_writer_without_anything_to_write_does_not_seem_to_hang(idle_s: float, patience_s: float) -> None:
-    """Its rounds are far shorter than what is held for a hang: a machine under load may wake it late."""
+    """Its rounds are far shorter than the timeout: on a busy machine it may wake up late."""
     assert idle_s <= patience_s / 2
