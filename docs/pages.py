@@ -24,9 +24,8 @@ HEAD: Final = """\
 
 None is required. Set them in a parameter file (`--ros-args --params-file my.yaml`) or one by one
 (`--ros-args -p camera.rate_hz:=5.0`). `shadowhound-data init` writes a file for your robot;
-[generic.yaml](../launch_configs/generic.yaml) is a start for any robot, and
-[go2.yaml](../launch_configs/go2.yaml) has all parameters with the defaults for a Unitree Go2. With an unknown name
-or an invalid value the node exits with code 2 and says what is allowed.
+[generic.yaml](../launch_configs/generic.yaml) is one for any robot, [go2.yaml](../launch_configs/go2.yaml) has all
+defaults for a Unitree Go2. With an unknown name or an invalid value the node exits with code 2.
 
 Defaults are in parentheses after the name, what is allowed at the end. **Live** parameters can be changed while the node runs:
 
@@ -35,7 +34,7 @@ Defaults are in parentheses after the name, what is allowed at the end. **Live**
     shadowhound-data node params                              # the present values
 
 ## What most people set
-A complete parameter file. Where the data goes is in the [environment](#environment-variables).
+Where the data is sent is in the [environment](#environment-variables).
 
 ```yaml
 """
@@ -58,17 +57,15 @@ COMMANDS: Final = """\
 `shadowhound-data VERB --help` has all options of a verb, with examples. Most verbs print JSON with `--json`.
 Times are UTC: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
 
-An error names the verb, what is wrong, and on the next line what to do. With `--json` it is one line of JSON on standard error,
-and nothing is printed on standard output:
+An error has the verb, what is wrong, and what to do; with `--json` as a line on standard error, and nothing on standard output:
 
     {"error": "there is no sensor 'camra'", "remedy": "is it 'camera'?", "verb": "shadowhound-data query", "exit_code": 2}
 
-A name that does not exist in the store (robot, sensor, topic, mission, label, ...) is a usage error. If nothing matches, the
-answer is empty and the exit code is 0.
+A name that is not in the store (robot, sensor, topic, mission, label, ...) is a usage error. An empty answer has exit code 0.
 
 ## Completion in the shell
-The package installs completion for bash. If your shell does not find it, put one of these lines into `~/.bashrc`; the second also
-works in a virtual environment, and with `zsh_source` and `fish_source` in other shells:
+The package installs it for bash. If your shell does not find it, put one of these lines into `~/.bashrc`; the second also
+works in a virtual environment, and in other shells with `zsh_source` and `fish_source`:
 
     source $(ros2 pkg prefix shadowhound_data_logger)/share/bash-completion/completions/shadowhound-data
     eval "$(_SHADOWHOUND_DATA_COMPLETE=bash_source shadowhound-data)"
@@ -120,13 +117,13 @@ SECTIONS: Final = (
     ),
     Section(
         'Limit the disk',
-        'Objects that wait for the store are on the disk of the robot. When it is full, those of the lowest priority '
-        'are deleted, the oldest first, and the ledger counts them as `evicted`.',
+        'Objects wait on the disk of the robot. When it is full, those of the lowest priority are deleted, the oldest first, '
+        'and counted as `evicted`.',
         ('spool.max_bytes', 'spool.min_free_bytes', 'SENSOR.priority'),
     ),
     Section(
         'Keep data on the robot until it is requested',
-        'Data that is `on_request` stays on the disk of the robot until it is requested ([how](keep.md)).',
+        'How: [keep](keep.md).',
         ('SENSOR.ship', 'bag.ship', 'keep.max_bytes', 'keep.days', 'keep.thin_to_hz', 'keep.missions'),
     ),
     Section(
@@ -142,8 +139,7 @@ SECTIONS: Final = (
     ),
     Section(
         'Keep what led to an event',
-        'The last seconds of some topics are held in memory, and an event makes a bag of them. Off while no topic is named '
-        '([bags](bags.md#events)).',
+        'In memory, for a bag at an event; off while no topic is named ([bags](bags.md#events)).',
         (
             'events.topics',
             'events.regex',
@@ -156,7 +152,7 @@ SECTIONS: Final = (
     ),
     Section(
         'Log missions',
-        'What the node adds to the run of a mission of its robot ([missions](missions.md)).',
+        'What the node adds to the run of a mission ([missions](missions.md)).',
         ('mission.join', 'mission.frames', 'mission.frame_every_s', 'mission.battery', 'mission.temperature', 'mission.odometry'),
     ),
 )
@@ -217,24 +213,24 @@ USUAL: Final = {
 """Variables that most people set."""
 VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ('AWS_ENDPOINT_URL', 'the folder `$SHADOWHOUND_HOME/store`', 'The S3 server, such as `http://SERVER:9000`.'),
-    ('AWS_ENDPOINT_URL_S3', '', 'The same for S3 only; takes precedence, as in all AWS programs.'),
+    ('AWS_ENDPOINT_URL_S3', '', 'The same for S3 only; takes precedence.'),
     ('AWS_ACCESS_KEY_ID', '', 'Its access key.'),
     ('AWS_SECRET_ACCESS_KEY', '', 'Its secret key.'),
     ('AWS_SESSION_TOKEN', '', 'For temporary credentials.'),
-    ('AWS_REGION', '`us-east-1`', 'The region that requests are signed for; most self-hosted servers ignore it.'),
+    ('AWS_REGION', '`us-east-1`', 'The region of the signature; most self-hosted servers ignore it.'),
     ('AWS_DEFAULT_REGION', '', 'The same, if `AWS_REGION` is not set.'),
     ('SHADOWHOUND_HOME', '`~/.shadowhound`', 'Contains `spool/` and, without a server, `store/`.'),
     ('SHADOWHOUND_ROBOT', '', 'The name of the robot, if the parameter `robot` is empty.'),
 )
 """Name, default, meaning of each variable that config.py reads for the node and the command line."""
 OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
-    ('SHADOWHOUND_PARAMETERS', '', 'The parameter file; read by the systemd unit and the doctor, not by the node itself.'),
+    ('SHADOWHOUND_PARAMETERS', '', 'The parameter file, for the systemd unit and the doctor, not the node.'),
     ('SHADOWHOUND_POLICY', '', 'The registered model that `policy sync` and `policy run` follow.'),
     ('SHADOWHOUND_POLICY_KEYS', '`policy-keys` in SHADOWHOUND_HOME', 'The folder with the keys that sign policies.'),
     (
         'SHADOWHOUND_KEY_PASSPHRASE',
         '',
-        'The passphrase of keys made with `policy keys --encrypt`; otherwise it is prompted for.',
+        'The passphrase of keys of `policy keys --encrypt`; otherwise prompted for.',
     ),
     (
         'SHADOWHOUND_POLICY_ISOLATION',
@@ -246,7 +242,7 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     (
         'SHADOWHOUND_PORT_GUARD',
         '`on`',
-        'With `off`, ports in shared memory that killed listeners leave are not repaired ([why](reliability.md#limits)).',
+        'With `off`, ports of killed listeners are not repaired ([why](reliability.md#limits)).',
     ),
     (
         'AWS_SHARED_CREDENTIALS_FILE',
@@ -254,7 +250,7 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
         'The keys, if the two variables are not set; read again when the server rejects them ([how](thor.md#rotate-keys)).',
     ),
     ('AWS_PROFILE', '`default`', 'The section of that file.'),
-    ('HTTP_PROXY', '', 'The proxy for `http://` servers, as for `curl`; `HTTPS_PROXY` for `https://`. `ALL_PROXY` is ignored.'),
+    ('HTTP_PROXY', '', 'The proxy for `http://` servers; `HTTPS_PROXY` for `https://`. `ALL_PROXY` is ignored.'),
     ('NO_PROXY', '', 'Hosts without a proxy: names, ends of names, `host:port`, `*`; networks such as `10.0.0.0/8` are ignored.'),
     ('AWS_CA_BUNDLE', "the system's", 'Certificate of your authority, for the S3 server ([TLS](thor.md#tls)).'),
     ('REQUESTS_CA_BUNDLE', '', 'The same, for the S3 server and MLflow.'),
@@ -305,7 +301,7 @@ def _verb(name: str, verb: click.Command) -> Iterator[str]:
     if isinstance(verb, click.Group):
         yield from _rows((name,), verb)
     else:
-        yield from (f'    {line}\n' for line in _examples(verb)[:1])
+        yield from (f'    {line}\n' for line in _examples(verb)[:1] if line != f'shadowhound-data {name}')
 
 
 def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
@@ -375,7 +371,7 @@ def _allowed(spec: Field[Any]) -> Iterator[str]:
     if choices:
         yield f'({", ".join(f"`{choice}`" for choice in choices)})'
     elif low is not None:
-        yield f'({_figure(low)}{_binary(low)} or more)' if high is None else f'({_figure(low)} to {_figure(high)})'
+        yield f'({_binary(low)[2:] or _figure(low)} or more)' if high is None else f'({_figure(low)} to {_figure(high)})'
 
 
 def _shown(value: Any) -> str:

@@ -44,37 +44,32 @@ class SensorSettings:
 
     name: str
     enabled: bool = _setting(True, 'Log this sensor.', live=True)
-    topics: tuple[str, ...] = _setting((), 'Topics it can come from, the preferred one first; relative to the namespace.')
+    topics: tuple[str, ...] = _setting((), 'Its topics, the preferred one first; relative to the namespace.')
     types: tuple[str, ...] = _setting(
         (),
-        'Message type of each topic, alternatives separated by |; others on it are not logged. Where empty, the first that is '
-        'published.',
+        'Type of each topic, alternatives separated by |; others are not logged. Empty: the first that is published.',
     )
     rate_hz: float = _setting(
         1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6, live=True
     )
-    on_change: bool = _setting(False, 'Keep a message only when its content, apart from its stamp, differs from the last one.')
-    batch_s: float = _setting(0.0, 'Seconds of messages in one object; 0 makes an object of each message.', low=0.0, high=3600.0)
+    on_change: bool = _setting(False, 'Keep only messages whose content, apart from the stamp, changed.')
+    batch_s: float = _setting(0.0, 'Seconds of messages per object; 0: one message.', low=0.0, high=3600.0)
     format: str = _setting('json', 'File format of an object; zip and tar hold several messages.', choices=FORMATS)
     quality: int = _setting(85, 'JPEG quality if an image must be encoded.', low=1, high=100, live=True)
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
-    dedup: bool = _setting(False, 'Store content that repeats, byte for byte, only once; the repeats stay in the catalog.')
+    dedup: bool = _setting(False, 'Store content that repeats byte for byte once; repeats stay in the catalog.')
     priority: int = _setting(
         5, '0 is uploaded first and dropped or evicted last; 9 is uploaded last and evicted first.', low=0, high=9, live=True
     )
     expected_hz: float = _setting(
-        0.0, 'Rate at which it is published, to estimate losses where messages have no numbers; 0 learns it.', low=0.0, high=1e5
+        0.0, 'Published rate, to estimate losses where messages have no numbers; 0 learns it.', low=0.0, high=1e5
     )
-    ship: str = _setting(
-        ALWAYS, 'Upload its objects always, or keep them on the robot and upload those that are requested.', choices=SHIPS
-    )
-    counter: str = _setting(
-        '', 'Field that counts messages or milliseconds, such as tick, to estimate losses from it instead of from stamps.'
-    )
+    ship: str = _setting(ALWAYS, 'Upload its objects always, or keep them until they are requested.', choices=SHIPS)
+    counter: str = _setting('', 'Field that counts messages or milliseconds, such as tick, to estimate losses from.')
 
     statistics: tuple[str, ...] = _setting(
-        ('',), 'Fields whose statistics go to the catalog, such as bms_state.soc; none named: the first 64; "none": none.'
+        ('',), 'Fields with statistics, such as bms_state.soc; empty: the first 64; "none": none.'
     )
 
     @property
@@ -98,8 +93,8 @@ class CaptureSettings:
     )
     topics: str = _setting(
         AUTO,
-        'sensors: log the topics of the sensors; all: also any other topic whose type has a rule; auto: all, unless sensors are '
-        'listed or the robot is a Unitree.',
+        'sensors: only their topics; all: also any topic whose type has a rule; auto: all, unless sensors are listed or the '
+        'robot is a Unitree.',
         choices=(AUTO, NAMED, ALL),
     )
 
@@ -123,7 +118,7 @@ class SpoolSettings:
     min_free_bytes: int = _setting(2 * GIBI, 'Free space to leave on the disk.', low=0)
     remember_days: float = _setting(
         2.0,
-        'Days for which delivered objects are remembered, for ledger --verify and the live page: some 20 MB per hour of logging.',
+        'Days to remember delivered objects, for ledger --verify and the live page: some 20 MB per hour of logging.',
         low=1.0,
         high=3650.0,
     )
@@ -138,15 +133,13 @@ class KeepSettings:
     )
     days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
     thin_to_hz: float = _setting(
-        1.0, 'Once space runs short, old images and clouds are thinned to this rate before any are evicted; 0: never.', low=0.0,
+        1.0, 'Thin old images and clouds to this rate before any are evicted; 0: never.', low=0.0,
         high=1000.0
     )  # fmt: skip
-    missions: tuple[str, ...] = _setting(('',), 'Types of missions of which everything is uploaded always.')
-    preview_s: float = _setting(
-        1.0, 'Seconds between two previews of a camera, which are uploaded immediately; 0 makes none.', low=0.0, high=3600.0
-    )
+    missions: tuple[str, ...] = _setting(('',), 'Types of missions that are always uploaded completely.')
+    preview_s: float = _setting(1.0, 'Seconds between two previews of a camera; 0: none.', low=0.0, high=3600.0)
     poll_s: float = _setting(10.0, 'Seconds between two checks for requests.', low=0.5, high=3600.0)
-    when: str = _setting('', 'Upload requested objects only while this rule is true; empty: always.')
+    when: str = _setting('', 'Rule for requested objects; empty: always.')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,12 +151,10 @@ class UploadSettings:
     """Not a parameter: set by the doctor and by tests."""
     read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer of the store.', low=0.1, high=600.0)
     max_backoff_s: float = _setting(
-        60.0, 'Longest pause between two attempts while the store cannot be reached.', low=0.1, high=3600.0
+        60.0, 'Longest pause between two attempts while the store is unreachable.', low=0.1, high=3600.0
     )
     max_mbps: float = _setting(0.0, 'Maximum megabits per second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
-    when: str = _setting(
-        '', 'Upload only while this rule is true: \'lowstate:bms_state.soc > 30 and wifi.ssid == "lab"\'; empty: always.'
-    )
+    when: str = _setting('', 'Upload only while this rule is true; empty: always.')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,7 +170,7 @@ class ClockSettings:
 
     max_offset_s: float = _setting(
         86_400.0,
-        'Seconds that a stamp may be before or after the arrival of its message; a message outside this is dated by its arrival.',
+        'Seconds that a stamp may differ from the arrival; otherwise the arrival dates the message.',
         low=1.0,
         high=1e9,
     )
@@ -197,12 +188,11 @@ class MissionSettings:
     """What the node does while a mission of its robot is active."""
 
     capture: str = _setting('always', 'When sensor data is stored: always, or only while a mission is active.', choices=CAPTURES)
-    join: bool = _setting(True, "Log the robot's state to the mission's run in addition to what the agent logs.")
+    join: bool = _setting(True, "Log the robot's state to the mission's run.")
     period_s: float = _setting(1.0, 'Seconds between two points of a metric.', low=0.01, high=3600.0)
     battery: str = _setting(
         'lowstate:bms_state.soc|battery_state:percentage|sensor_msgs/msg/BatteryState:percentage|unitree_hg/msg/BmsState:soc',
-        'Topic or message type, and field, of battery_pct; alternatives separated by | (the first that is published); empty for '
-        'none.',
+        'Topic or type, and field, of battery_pct; alternatives separated by | (the first published); empty: none.',
     )
     temperature: str = _setting(
         'go2_interfaces/msg/IMU:temperature|unitree_go/msg/LowState:imu_state.temperature|sensor_msgs/msg/Temperature:temperature',
@@ -210,13 +200,13 @@ class MissionSettings:
     )
     odometry: str = _setting(
         'odom|nav_msgs/msg/Odometry',
-        'Topic or message type of pose, trajectory and distance; alternatives separated by |; empty for none.',
+        'Topic or type of pose, trajectory and distance; alternatives separated by |; empty: none.',
     )
     frames: str = _setting(
         'camera|sensor_msgs/msg/CompressedImage|sensor_msgs/msg/Image',
-        'Sensor or message type with the images that become frames of the run; alternatives separated by |; empty for none.',
+        'Sensor or type of the images that become frames of the run; alternatives separated by |; empty: none.',
     )
-    frame_every_s: float = _setting(5.0, 'Seconds between two of these frames.', low=0.0, high=1e6)
+    frame_every_s: float = _setting(5.0, 'Seconds between these frames.', low=0.0, high=1e6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -237,15 +227,11 @@ class BagSettings:
     topics: tuple[str, ...] = _setting(('',), 'Topics to record; with neither topics nor a regex, those of the sensors.')
     regex: str = _setting('', 'Record also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
     exclude: str = _setting('', 'Skip topics that match this, unless they are in topics.')
-    slice_s: float = _setting(
-        60.0, 'Seconds in one file of a bag; each is uploaded while the next one is recorded.', low=1.0, high=86_400.0
-    )
+    slice_s: float = _setting(60.0, 'Seconds in one file of a bag.', low=1.0, high=86_400.0)
     slice_bytes: int = _setting(256 * MEBI, 'Maximum bytes in one file of a bag.', low=MEBI)
     compression: str = _setting('zstd', 'Compression of the bag.', choices=COMPRESSIONS)
     priority: int = _setting(8, '0 is uploaded first and evicted last; 9 is uploaded last and evicted first.', low=0, high=9)
-    ship: str = _setting(
-        ALWAYS, 'Upload bags always, or keep them on the robot and upload the slices that are requested.', choices=SHIPS
-    )
+    ship: str = _setting(ALWAYS, 'Upload bags always, or keep their slices until they are requested.', choices=SHIPS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -261,14 +247,12 @@ class EventSettings:
     )
     max_s: float = _setting(
         120.0,
-        'Maximum seconds from the first trigger to the end of an event; then another event begins.',
+        'Maximum seconds from the first trigger to the end of an event.',
         low=1.0,
         high=1e5,
         live=True,
     )
-    max_bytes: int = _setting(
-        64 * MEBI, 'Memory for what is kept; beyond it the oldest messages are dropped, whatever pre_s is.', low=MEBI, live=True
-    )
+    max_bytes: int = _setting(64 * MEBI, 'Memory for them; beyond it the oldest messages are dropped.', low=MEBI, live=True)
     log_event: str = _setting(
         '.*', "An agent's log_event triggers an event where its name matches this regular expression; empty for none.", live=True
     )
@@ -276,7 +260,7 @@ class EventSettings:
         ('',),
         'What triggers an event: "low_battery: lowstate:bms_state.soc < 20 for 5" is name, topic:field, comparison, seconds.',
     )
-    when: str = _setting('', 'Upload the bags of events only while this rule is true; empty: always, whatever upload.when says.')
+    when: str = _setting('', 'Rule for bags of events, instead of upload.when; empty: always.')
 
     @property
     def enabled(self) -> bool:
