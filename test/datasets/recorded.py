@@ -1,4 +1,4 @@
-"""A robot's missions for the tests of datasets: objects made by the node's own encoders, every value a formula of its stamp."""
+"""A robot's missions for the tests of datasets: objects made by the node's encoders, every value a formula of its stamp."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores import open_store
 
 SIZE: Final = (64, 96)
-"""Height and width of the pictures: no smaller ones can be AV1."""
+"""Height and width of the images: the minimum for AV1."""
 TOPICS: Final = {'camera': '/camera', 'odom': '/odom', 'imu': '/imu', 'joints': '/joints', 'cmd_vel': '/cmd_vel'}
-"""As the encoder's tests name them."""
+"""The names that the encoder's tests use."""
 TWIST: Final = 'geometry_msgs/msg/Twist'
 Hits = Callable[[int, int], bool]
-"""Whether the message of a number and a stamp is there."""
+"""Whether the message with a number and a stamp exists."""
 
 
 def every(_number: int, _stamp_ns: int) -> bool:
@@ -41,12 +41,12 @@ def every(_number: int, _stamp_ns: int) -> bool:
 
 
 def x_of(stamp_ns: int) -> float:
-    """Where the robot is: exact in a float32 for a minute of milliseconds."""
+    """The robot's x position: exact in a float32 for a minute of milliseconds."""
     return round((stamp_ns - NOON_NS) / SECOND % 4096, 3)
 
 
 def pixels(stamp_ns: int) -> Any:
-    """A picture from which its time can be read: a bar that moves, on a slope of colours."""
+    """An image that shows its time: a moving bar on a color gradient."""
     height, width = SIZE
     rows, columns = np.mgrid[0:height, 0:width]
     tenth = (stamp_ns - NOON_NS) // (SECOND // 10)
@@ -58,7 +58,7 @@ def pixels(stamp_ns: int) -> Any:
 
 @dataclass
 class Mission:
-    """What a robot published in a mission, and what of it arrived."""
+    """The published messages of a mission, and those that arrived."""
 
     name: str
     begin_s: float = 0.0
@@ -71,14 +71,14 @@ class Mission:
     """Sensor -> which of its messages arrived."""
     gaps: Sequence[Statement] = ()
     told_until_s: float = 1.0
-    """How long after its end the watermarks reach."""
+    """How long after its end the watermarks extend."""
     sensors: Sequence[str] = ('camera', 'odom', 'imu', 'joints')
     uncounted: Sequence[str] = ()
-    """Sensors of which the robot cannot tell what is missing: it never speaks of them."""
+    """Sensors for which the robot cannot count losses: it never reports on them."""
     late_ns: Callable[[str, int], int] | None = None
-    """Sensor and stamp -> how much later the message arrived; None for all at once."""
+    """Sensor and stamp -> the delay of the message; None for immediate arrival."""
     skipped: int = 0
-    """Messages of each sensor that its settings left out, by the watermark."""
+    """Messages of each sensor that its settings skipped, by the watermark."""
 
     @property
     def begin_ns(self) -> int:
@@ -89,7 +89,7 @@ class Mission:
         return self.begin_ns + round(self.seconds * SECOND)
 
     def stamps(self, sensor: str) -> list[int]:
-        """Of the messages that arrived, from a second before the mission to a second after it."""
+        """The stamps of the messages that arrived, from a second before the mission to a second after it."""
         rate = {'camera': self.camera_hz, 'odom': self.odom_hz, 'cmd_vel': 20.0}.get(sensor, 25.0)
         count = round((self.seconds + 2) * rate)
         every_one = [self.begin_ns - SECOND + round(number * SECOND / rate) for number in range(count)]
@@ -109,7 +109,7 @@ class House:
         self._parts = 0
 
     def record(self, mission: Mission, *, archives: bool = True) -> Mission:
-        """Objects of a second each (single pictures without ``archives``), the summary, the gaps and the watermarks."""
+        """Objects of one second each (single images without ``archives``), the summary, the gaps and the watermarks."""
         made = []
         for sensor in mission.sensors:
             stamps = mission.stamps(sensor)
@@ -135,7 +135,7 @@ class House:
         return mission
 
     def tell(self, mission: Mission, until_s: float) -> None:
-        """What the robot says of this mission's losses, up to so long after its end."""
+        """The robot's statements about this mission's losses, up to this time after its end."""
         until = mission.end_ns + round(until_s * SECOND)
         marks = [
             complete('thor', 'j', 10 + self._parts, sink='objects', topic=TOPICS[sensor], session=1 + round(mission.begin_s),
@@ -154,7 +154,7 @@ class House:
 
 
 def _arrived(mission: Mission, sensor: str, stamps: Sequence[int], made: DataObject) -> DataObject:
-    """With the pair of arrivals."""
+    """With both arrival times."""
     if mission.late_ns is None:
         return made
     received = [stamp + mission.late_ns(sensor, stamp) for stamp in stamps]
@@ -191,7 +191,7 @@ def header(stamp: int) -> dict[str, Any]:
 
 
 def lost(mission: Mission, sensor: str, first_s: float, last_s: float, cause: str = 'transport', **more: Any) -> Statement:
-    """A gap from one second of a mission to another, as the journal states it."""
+    """A gap from one second of a mission to another, as in the journal."""
     named = {
         'sink': 'objects',
         'topic': TOPICS[sensor],
@@ -207,5 +207,5 @@ def lost(mission: Mission, sensor: str, first_s: float, last_s: float, cause: st
 
 
 def kill_this_process(*_: Any) -> None:
-    """In a worker, which imports this module: those of tests have no name that it could import."""
+    """In a worker, which imports this module: the tests' own modules cannot be imported there."""
     os.kill(os.getpid(), signal.SIGKILL)

@@ -44,14 +44,14 @@ def jittered(sensor: str, number: int) -> int:
 
 
 def arm_stamps(mission: Mission) -> list[int]:
-    """By the robot's clock, 50 Hz, jittered."""
+    """Stamps by the robot's clock, 50 Hz, jittered."""
     count = round((mission.seconds + 2) * so_arm.RATE_HZ)
     return [mission.begin_ns - SECOND + round(number * SECOND / so_arm.RATE_HZ) + number * 6007 % 5 * 1_000_000
             for number in range(count)]  # fmt: skip
 
 
 def record_arm(house: House, mission: Mission, clock: so_arm.ArmClock = CLOCK, *, events: bool = True) -> None:
-    """What the arm's machine stored of a mission by its own clock, and the events that the robot noted."""
+    """The arm's stored data of a mission by its clock, and the events that the robot recorded."""
     ros, stamps = house.drive._ros, arm_stamps(mission)
 
     def stored(robot: str, topic: str, kind: str, own: Sequence[int], cdrs: Sequence[bytes]) -> None:
@@ -75,7 +75,7 @@ def record_arm(house: House, mission: Mission, clock: so_arm.ArmClock = CLOCK, *
 
 @pytest.fixture(scope='module')
 def house(tmp_path_factory: pytest.TempPathFactory) -> House:
-    """A task of twenty episodes over half a day, in which the arm's clock goes away by nearly a second; the last has no event."""
+    """A task of twenty episodes over half a day, in which the arm's clock drifts by nearly a second; the last has no event."""
     made = House(tmp_path_factory.mktemp('house'))
     for number in range(EPISODES):
         mission = Mission(f'fetch{number:02d}', begin_s=2000.0 * number, seconds=2, camera_hz=10, task='fetch the cup',
@@ -91,7 +91,7 @@ def exported(house: House) -> Exported:
 
 
 def test_the_measured_offset_is_exact(exported: Exported) -> None:
-    """Within a millisecond of the truth at each tick of all episodes, and never farther than the uncertainty says."""
+    """Within a millisecond of the truth at each tick of all episodes, and never outside the uncertainty."""
     assert len(exported.added) == EPISODES - 1
     made = Lerobot(exported.folder)
     for row in made.rows:
@@ -109,7 +109,7 @@ def test_an_episode_with_an_unknown_offset_is_rejected(exported: Exported) -> No
 
 
 def test_each_tick_has_the_newest_value_of_both_machines(house: House, exported: Exported) -> None:
-    """The newest of each at or before it, by the robot's clock, under the names that LeKiwi has."""
+    """The newest of each at or before it, by the robot's clock, under LeKiwi's names."""
     made = Lerobot(exported.folder)
     assert made.info is not None
     features = made.info['features']
@@ -123,7 +123,7 @@ def test_each_tick_has_the_newest_value_of_both_machines(house: House, exported:
         state, action, age = (made.numbers(row, key) for key in ('observation.state', 'action', 'shadowhound.age_s'))
         published = np.array(arm_stamps(mission))
         newest = published[np.searchsorted(published, ticks, 'right') - 1]
-        # Where a message came within the uncertainty of the tick, the one before it may be taken.
+        # If a message arrived within the uncertainty of the tick, the previous one may be used.
         sure = ticks - newest > 400_000
         assert sure.sum() > len(ticks) / 2
         assert state[sure, :6] == pytest.approx(np.array([so_arm.positions(int(stamp)) for stamp in newest[sure]]), abs=1e-5)
@@ -140,7 +140,7 @@ def test_each_tick_has_the_newest_value_of_both_machines(house: House, exported:
 
 
 def test_the_arm_is_a_source_like_the_robot(house: House, exported: Exported) -> None:
-    """Each value names the object, its hash and the time by the arm's own clock; all of it is proved."""
+    """Each value names the object, its hash and the time by the arm's clock; all of them are verified."""
     sources = pq.read_table(exported.folder / 'meta/shadowhound_sources.parquet')
     of_arm = sources.filter(pc.equal(sources['stream'], 'state.arm')).to_pylist()
     assert {each['key'].split('/')[0] for each in of_arm} == {'soarm'}
@@ -153,7 +153,7 @@ def test_the_arm_is_a_source_like_the_robot(house: House, exported: Exported) ->
 
 @pytest.mark.long('a second of CPU or more')
 def test_an_offset_beyond_half_a_tick_is_refused(house: House, tmp_path: Path) -> None:
-    """Of one given pair, half an hour away, nobody knows the offset; of one near by, to 0.2 ms a second."""
+    """With one given pair, half an hour away, the offset is unknown; near a pair it drifts by 0.2 ms per second."""
     mission = Mission('', begin_s=2000.0 * (EPISODES - 1), seconds=2)
     flags: dict[str, Any] = {'mission': LAST}
     for away_s, refused in ((1800, 'not known'), (500, r'is known to 100\.\d ms, half a tick is 50\.0 ms')):
@@ -167,7 +167,7 @@ def test_an_offset_beyond_half_a_tick_is_refused(house: House, tmp_path: Path) -
 
 
 def test_without_an_arm_there_are_no_columns_of_it(house: House, tmp_path: Path) -> None:
-    """The same code, the same missions."""
+    """With the same code and the same missions."""
     export(tmp_path / 'set', house.source, {'mission': 'fetch00'}, ExportOptions(state=('velocity',), max_stale=0.1))
     made = Lerobot(tmp_path / 'set')
     assert made.info is not None
@@ -176,7 +176,7 @@ def test_without_an_arm_there_are_no_columns_of_it(house: House, tmp_path: Path)
 
 
 def test_a_clock_that_steps_has_no_offset() -> None:
-    """A step in the middle of an episode is not a drift."""
+    """A step during an episode is not a drift."""
     times = NOON_NS + np.arange(30) * SECOND
     stepped = np.column_stack([times, times + np.where(np.arange(30) < 15, 0, SECOND // 2)])
     with pytest.raises(LakeError, match='was set during that time'):

@@ -1,4 +1,4 @@
-"""Missions exported in parallel by Ray's workers have the bytes of a local export, whichever worker is killed."""
+"""Missions exported in parallel by Ray's workers are byte-identical to a local export, whichever worker is killed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ON_RAY: Final = ['--ray', 'auto', '--workers', '2']
 SHORT: Final = TemporaryDirectory(prefix='ray', ignore_cleanup_errors=True)
 """Ray's sockets need a short path."""
 BUILDS: Final = b'ray::Builder.build'
-"""The title of a worker while it makes an episode."""
+"""The process title of a worker while it builds an episode."""
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.long('starts Ray'),
@@ -45,14 +45,14 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def finished(process: subprocess.Popen[str], code: int = 0) -> tuple[str, str]:
-    """What it printed, and what it said on standard error."""
+    """Its output on standard output and standard error."""
     out, err = process.communicate(timeout=600)
     assert process.returncode == code, err[-3000:]
     return out, err
 
 
 def builders(of: int) -> Iterator[int]:
-    """Process ids of the workers that make episodes, among the descendants of a process."""
+    """Process ids of the workers that build episodes, among the descendants of a process."""
     parents, titles = dict[int, int](), dict[int, bytes]()
     for folder in Path('/proc').iterdir():
         if folder.name.isdigit():
@@ -70,7 +70,7 @@ def builders(of: int) -> Iterator[int]:
 
 
 def kill_builders(process: subprocess.Popen[str], most: int) -> int:
-    """With SIGKILL, as soon as they make an episode, so many or all until the program ends; how many there were."""
+    """Kill this many, or all until the program ends, with SIGKILL as soon as they build an episode; returns their number."""
     killed = set[int]()
     while process.poll() is None and len(killed) < most:
         for pid in {*builders(process.pid)} - killed:
@@ -78,7 +78,7 @@ def kill_builders(process: subprocess.Popen[str], most: int) -> int:
             killed.add(pid)
             if len(killed) == most:
                 break
-        time.sleep(0.02)  # between two looks
+        time.sleep(0.02)  # between two polls
     return len(killed)
 
 
@@ -92,7 +92,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> House:
 
 @pytest.fixture(scope='module')
 def wanted(house: House) -> dict[str, bytes]:
-    """The files of the dataset that this machine makes alone, one episode after the other."""
+    """The files of the dataset that this machine creates alone, one episode after the other."""
     finished(start(house.folder, '--to', 'alone'))
     found = contents(house.folder / 'alone')
     assert len(Lerobot(house.folder / 'alone').mission_ids) == 3
@@ -107,7 +107,7 @@ def test_two_workers_write_what_this_machine_writes(house: House, wanted: dict[s
 
 
 def test_the_mission_of_a_killed_worker_is_given_to_another_one(house: House, wanted: dict[str, bytes]) -> None:
-    """It begins anew, and the files are the same."""
+    """It starts again, and the files are the same."""
     process = start(house.folder, '--to', 'killed', '--json', *ON_RAY)
     assert kill_builders(process, 1) == 1
     told, _ = finished(process)
@@ -116,7 +116,7 @@ def test_the_mission_of_a_killed_worker_is_given_to_another_one(house: House, wa
 
 
 def test_a_mission_that_no_worker_survives_is_named(house: House, wanted: dict[str, bytes]) -> None:
-    """Nothing was added then, in whatever order workers died; the next run gives the same files."""
+    """Nothing was added, in whatever order workers were killed; the next run gives the same files."""
     process = start(house.folder, '--to', 'dying', *ON_RAY)
     assert kill_builders(process, 100) >= 9
     _, said = finished(process, 1)

@@ -1,4 +1,4 @@
-"""A dataset has what each mission recorded, as known at each tick, states gaps and sources, and survives kills."""
+"""A dataset has the recordings of each mission, as known at each tick, records gaps and sources, and survives kills."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ PATROLS = {'mission_type': 'patrol'}
 
 
 def jittered(sensor: str, number: int) -> int:
-    """Each message is moved by an amount of its own, up to 8 ms."""
+    """Each message is delayed individually, up to 8 ms."""
     return (number * 7919 + len(sensor) * 104729) % 8 * 1_000_000
 
 
 @pytest.fixture(scope='module')
 def house(tmp_path_factory: pytest.TempPathFactory) -> House:
-    """Three missions: a jittered one, one with gaps, one that the robot has not told all of."""
+    """Three missions: a jittered one, one with gaps, one with incomplete reports from the robot."""
     made = House(tmp_path_factory.mktemp('house'))
     made.record(Mission('whole', seconds=3, jitter_ns=jittered))
     gappy = Mission('gappy', begin_s=100, seconds=4)
@@ -76,7 +76,7 @@ def exported(house: House) -> Exported:
 
 
 def test_a_mission_becomes_an_episode_once_its_gaps_are_known(exported: Exported) -> None:
-    """The one of which the robot has not told all waits, and says for what."""
+    """The one with incomplete reports waits, and the reason is reported."""
     assert [each['mission_id'] for each in exported.added] == ['whole', 'gappy']
     assert list(exported.waiting) == ['fresh']
     assert '3.0 s before its end so far' in exported.waiting['fresh']
@@ -84,7 +84,7 @@ def test_a_mission_becomes_an_episode_once_its_gaps_are_known(exported: Exported
 
 
 def test_no_value_of_a_tick_comes_from_its_future(house: House, exported: Exported) -> None:
-    """Each message has been moved by its own amount: every number is still the newest one at or before its tick."""
+    """Each message has an individual delay: every number is still the newest one at or before its tick."""
     made = Lerobot(exported.folder)
     mission = Mission('whole', seconds=3, jitter_ns=jittered)
     stamps, state, age = rows_of(made, 'whole', 'shadowhound.stamp_ns', 'observation.state', 'shadowhound.age_s')
@@ -104,7 +104,7 @@ def test_no_value_of_a_tick_comes_from_its_future(house: House, exported: Export
 
 
 def test_a_gap_is_flagged_exactly_at_its_ticks(exported: Exported) -> None:
-    """With the cause that the journal states, or as not published where it knows of none."""
+    """With the cause in the journal, or as not published if there is none."""
     made = Lerobot(exported.folder)
     mission = Mission('gappy', begin_s=100, seconds=4)
     stamps, stale = rows_of(made, 'gappy', 'shadowhound.stamp_ns', 'shadowhound.stale')
@@ -128,7 +128,7 @@ def test_a_gap_is_flagged_exactly_at_its_ticks(exported: Exported) -> None:
 
 
 def seeded_gaps(seed: int) -> tuple[Mission, dict[str, list[tuple[float, float, str]]]]:
-    """A mission that loses something of every sensor eight times; and of each loss from when, to when, its cause."""
+    """A mission that loses messages of every sensor eight times; with the start, end and cause of each loss."""
     rng = np.random.default_rng(seed)
     mission = Mission(f'lossy{seed}', begin_s=1000 + 100 * seed, seconds=30)
     injected: dict[str, list[tuple[float, float, str]]] = {}
@@ -148,7 +148,7 @@ def seeded_gaps(seed: int) -> tuple[Mission, dict[str, list[tuple[float, float, 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('seed', range(3))
 def test_injected_gaps_are_flagged_at_exactly_their_ticks(tmp_path: Path, seed: int) -> None:
-    """Of every stream, with the cause of the gap that covers the tick, and nothing else is flagged."""
+    """For every stream, with the cause of the gap that covers the tick, and no other ticks are flagged."""
     place = House(tmp_path)
     mission, injected = seeded_gaps(seed)
     place.record(mission)
@@ -177,7 +177,7 @@ def test_injected_gaps_are_flagged_at_exactly_their_ticks(tmp_path: Path, seed: 
 
 
 def test_a_mission_with_too_large_gaps_is_refused(house: House, tmp_path: Path) -> None:
-    """With the reason, on the screen and in the report; ``allow_gaps`` takes it with its flags."""
+    """With the reason, on the screen and in the report; ``allow_gaps`` accepts it with its flags."""
     options = ExportOptions(max_stale=0.05)
     found = export(tmp_path / 'set', house.source, {'mission': 'gappy'}, options)
     assert list(found.refused) == ['gappy']
@@ -189,7 +189,7 @@ def test_a_mission_with_too_large_gaps_is_refused(house: House, tmp_path: Path) 
 
 @pytest.mark.long('a second of CPU or more')
 def test_it_waits_for_the_robots_gap_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And takes the mission then; after some time in which nothing was heard it gives up, and says for what it waited."""
+    """And accepts the mission then; after some time without reports it gives up, and reports the reason."""
     place = House(tmp_path)
     mission = place.record(Mission('late', seconds=2, sensors=('camera', 'odom'), told_until_s=-3))
     looked: list[float] = []
@@ -209,7 +209,7 @@ def test_it_waits_for_the_robots_gap_reports(tmp_path: Path, monkeypatch: pytest
 
 
 def test_it_does_not_wait_for_gaps_that_cannot_be_reported(tmp_path: Path) -> None:
-    """A topic of which it counts only what came has no watermark, ever: the mission is refused, with the reason."""
+    """A topic that only counts received messages never has a watermark: the mission is refused, with the reason."""
     place = House(tmp_path)
     place.record(Mission('blind', seconds=2, sensors=('camera', 'odom'), uncounted=('odom',)))
     found = export(tmp_path / 'set', place.source, PATROLS, ExportOptions(), wait=True, sleep=pytest.fail)
@@ -220,7 +220,7 @@ def test_it_does_not_wait_for_gaps_that_cannot_be_reported(tmp_path: Path) -> No
 
 
 def test_stale_ticks_without_a_gap_have_a_cause(tmp_path: Path) -> None:
-    """What the settings left out was not sampled; where the robot has told nothing, nobody knows."""
+    """Messages skipped by the settings were not sampled; without reports from the robot the cause is unknown."""
     place = House(tmp_path)
     thin = Mission('thin', seconds=2, sensors=('camera', 'odom'), skipped=7)
     thin.has['odom'] = lambda number, _: number % 10 == 0
@@ -239,12 +239,12 @@ def test_stale_ticks_without_a_gap_have_a_cause(tmp_path: Path) -> None:
 
 
 def test_values_are_interpolated_between_two_messages(house: House, tmp_path: Path) -> None:
-    """With linear, one period late: exactly where the robot was then, and its quaternion as long as it has to be."""
+    """With linear, one period late: exactly the robot's position then, and a normalized quaternion."""
     options = ExportOptions(resample={'odom': 'linear'}, validation=0.5)
     export(tmp_path / 'set', house.source, {'mission': 'whole'}, options)
     made = Lerobot(tmp_path / 'set')
     stamps, state = rows_of(made, 'whole', 'shadowhound.stamp_ns', 'observation.state')
-    stamps, state = stamps[2:], state[2:]  # x begins anew with the mission
+    stamps, state = stamps[2:], state[2:]  # x restarts with the mission
     assert state[:, 0] == pytest.approx([x_of(int(stamp)) - 0.02 for stamp in stamps[:, 0]], abs=5e-3)
     assert np.linalg.norm(state[:, 3:7], axis=1) == pytest.approx(1, abs=1e-6)
     yaw = 2 * np.arctan2(state[:, 5], state[:, 6])
@@ -255,12 +255,12 @@ LATE_NS, LATER_NS = 146 * SECOND, 149 * SECOND
 
 
 def late(mission: Mission, sensor: str, stamp: int) -> int:
-    """How much later than its stamp a message arrives: odometry is three seconds later in the second half of a mission."""
+    """The delay of a message: odometry is three seconds later in the second half of a mission."""
     return LATER_NS if sensor == 'odom' and stamp >= mission.begin_ns + 3 * SECOND else LATE_NS
 
 
 def test_every_source_has_both_times_and_a_changed_offset_is_flagged(tmp_path: Path) -> None:
-    """Of the pictures, of poses and of both poses of a velocity; a mission that is late all the time is not flagged."""
+    """For images, poses and both poses of a velocity; a mission with a constant delay is not flagged."""
     house = House(tmp_path)
     changed, steady = Mission('changed', seconds=6), Mission('steady', begin_s=60, seconds=6)
     changed.late_ns = lambda sensor, stamp: late(changed, sensor, stamp)
@@ -320,7 +320,7 @@ def test_by_received_frames_have_what_had_arrived(tmp_path: Path, *, archives: b
 
 
 def test_arrivals_do_not_go_with_another_clock() -> None:
-    """An arm's times are converted to the robot's; and there are two clocks to choose from."""
+    """An arm's times are converted to the robot's; only one of the two clocks can be selected."""
     for by, arm in (('arrival', ''), ('received', 'soarm')):
         with pytest.raises(SettingError, match='by = '):
             ExportOptions(by=by, arm=arm)
@@ -337,7 +337,7 @@ def test_arrivals_that_are_unknown_are_null(tmp_path: Path) -> None:
 
 
 def test_a_share_of_the_missions_is_for_validation() -> None:
-    """Chosen by the mission's id alone: about the share, and the same whoever else is there."""
+    """Chosen by the mission's id alone: about the share, and the same for any other missions."""
     names = [f'mission_{number}' for number in range(400)]
     held = [name for name in names if split_of(name, 0.25) == 'validation']
     assert 70 < len(held) < 130
@@ -347,7 +347,7 @@ def test_a_share_of_the_missions_is_for_validation() -> None:
 
 @pytest.mark.long('a second of CPU or more')
 def test_labels_are_a_column_and_choose_validation(tmp_path: Path) -> None:
-    """Of each frame those of its time and of its picture, as they stood; who said so is in a table, and the digest covers it."""
+    """Each frame has those of its time and of its image; their authors are in a table, and the digest includes them."""
     place = House(tmp_path)
     mission = place.record(Mission('one', seconds=2, sensors=('camera', 'odom')))
     place.record(Mission('two', begin_s=50, seconds=2, sensors=('camera', 'odom')))
@@ -381,7 +381,7 @@ def test_labels_are_a_column_and_choose_validation(tmp_path: Path) -> None:
 
 
 def test_frames_in_the_video_are_the_rows(exported: Exported) -> None:
-    """As many, at their times, and like their sources."""
+    """The same number, with their times, and similar to their sources."""
     made = Lerobot(exported.folder)
     for row in made.rows:
         path = made.folder / f'videos/observation.images.front/chunk-000/file-{row["episode_index"]:03d}.mp4'
@@ -390,7 +390,7 @@ def test_frames_in_the_video_are_the_rows(exported: Exported) -> None:
 
 
 def test_an_export_passes_verification(house: House, exported: Exported) -> None:
-    """And what is changed afterwards, here or in the store, is found."""
+    """And later changes, here or in the store, are found."""
     store = DirectoryStore(house.settings.directory)
     store.open()
     found = verify(exported.folder, store, frames=None, is_read=True)
@@ -400,7 +400,7 @@ def test_an_export_passes_verification(house: House, exported: Exported) -> None
 
 
 def test_verification_finds_changes(house: House, tmp_path: Path) -> None:
-    """A byte of a file, and an object that is not what it was."""
+    """A byte of a file, and a changed object."""
     place = House(tmp_path)
     place.record(Mission('only', seconds=2, sensors=('camera', 'odom')))
     export(tmp_path / 'set', place.source, PATROLS, ExportOptions(is_lossless=True))
@@ -418,7 +418,7 @@ def test_verification_finds_changes(house: House, tmp_path: Path) -> None:
 
 
 def test_another_mission_rewrites_nothing_before_it(house: House, tmp_path: Path) -> None:
-    """The files of the episodes before stay as they are, byte for byte, and the digest changes."""
+    """The files of earlier episodes are unchanged, byte for byte, and the digest changes."""
     first = export(tmp_path / 'set', house.source, {'mission': 'whole'}, ExportOptions())
     before = {path: path.read_bytes() for path in sorted((tmp_path / 'set').rglob('file-000.*'))}
     assert len(before) == 3
@@ -432,14 +432,14 @@ def test_another_mission_rewrites_nothing_before_it(house: House, tmp_path: Path
 
 @pytest.mark.long('starts two processes that import Daft')
 def test_two_workers_write_what_one_writes(house: House, exported: Exported, tmp_path: Path) -> None:
-    """And so does whoever begins anew."""
+    """And so does an export from scratch."""
     options = ExportOptions(state=('pose', 'imu', 'joints'), max_stale=0.2)
     export(tmp_path / 'set', house.source, PATROLS, options, workers=2)
     assert contents(tmp_path / 'set') == contents(exported.folder)
 
 
 def test_the_report_shows_stale_ticks_in_red(exported: Exported) -> None:
-    """On a line of time for each stream of each episode, and nowhere else on it."""
+    """On a timeline for each stream of each episode, and nowhere else on it."""
     made, picture = Lerobot(exported.folder), Image.open(exported.folder / 'meta/report.png').convert('RGB')
     assert picture.size == (report.WIDTH, len(made.rows) * (report.HEIGHT + report.GAP) + report.GAP)
     found = []
@@ -455,7 +455,7 @@ def test_the_report_shows_stale_ticks_in_red(exported: Exported) -> None:
 
 
 def test_nan_is_never_in_a_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A message with NaN counts as none: the value before it is held, grows old and becomes stale."""
+    """A message with NaN is ignored: the previous value is held until it is stale."""
     place = House(tmp_path)
     mission = Mission('odd', seconds=2, sensors=('camera', 'odom'))
     is_odd = lambda stamp: mission.begin_ns + SECOND <= stamp < mission.begin_ns + 1.4 * SECOND  # noqa: E731
@@ -487,7 +487,7 @@ def test_statistics_are_those_of_all_frames(exported: Exported) -> None:
 
 
 def test_commands_are_the_action_where_they_were_logged(tmp_path: Path) -> None:
-    """As they were at or before the tick, and not said to be derived; a mission without them does not fit."""
+    """The newest one at or before the tick, not marked as derived; a mission without commands is refused."""
     place = House(tmp_path)
     commanded = place.record(Mission('commanded', seconds=2, sensors=('camera', 'odom', 'cmd_vel')))
     place.record(Mission('silent', begin_s=50, seconds=2, sensors=('camera', 'odom')))
@@ -503,7 +503,7 @@ def test_commands_are_the_action_where_they_were_logged(tmp_path: Path) -> None:
 
 
 def test_other_settings_need_another_dataset(house: House, exported: Exported, tmp_path: Path) -> None:
-    """What it was created with holds for all of it; what no source has is refused, and what is there is told."""
+    """The settings of its creation hold for all of it; unknown names are refused, and the valid ones are listed."""
     with pytest.raises(LakeError, match='was created with codec av1'):
         export(exported.folder, house.source, PATROLS, ExportOptions(state=('pose', 'imu', 'joints'), codec='h264'))
     found = export(tmp_path / 'set', house.source, {'mission': 'whole'}, ExportOptions(fps=30))
@@ -514,7 +514,7 @@ def test_other_settings_need_another_dataset(house: House, exported: Exported, t
 
 @pytest.mark.long('a second of CPU or more')
 def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Path) -> None:
-    """Everywhere in the dataset, for good; the others have the numbers that they would have had without it."""
+    """Everywhere in the dataset, permanently; the others get the numbers that they would have without it."""
     options = ExportOptions(max_stale=0.3)
     export(tmp_path / 'set', house.source, PATROLS, options)
     key = pq.read_table(tmp_path / 'set' / SOURCE_TABLE)['key'][0].as_py()
@@ -537,7 +537,7 @@ def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Pat
 
 
 def test_a_dataset_is_uploaded_and_fetched_unchanged(house: House, exported: Exported, tmp_path: Path) -> None:
-    """Verified, twice without moving anything, and an object tells where it went."""
+    """Verified, the second time without a transfer, and an object leads to its datasets."""
     store = DirectoryStore(house.settings.directory)
     store.open()
     place = DatasetPlace.of('s3://lerobot/datasets/go2/patrol')
@@ -559,7 +559,7 @@ def test_a_dataset_is_uploaded_and_fetched_unchanged(house: House, exported: Exp
 
 
 def test_lerobot_doctor_finds_nothing_wrong(exported: Exported) -> None:
-    """An independent reader: no check of the format fails."""
+    """An independent reader: all of its format checks pass."""
     from lerobot_doctor.dataset_loader import load_dataset
     from lerobot_doctor.runner import Severity, run_checks
 
@@ -571,7 +571,7 @@ def test_lerobot_doctor_finds_nothing_wrong(exported: Exported) -> None:
 
 
 def test_videos_are_encoded_without_real_time_limits(tmp_path: Path) -> None:
-    """Where root writes it, SVT-AV1 would have its way before everything else on the machine; elsewhere it may not."""
+    """As root, SVT-AV1 would get real-time priority over everything else on the machine; this is prevented."""
     before = os.sched_getscheduler(0)
     with VideoWriter(tmp_path / 'a.mp4', 10, (64, 64), AV1) as video:
         video.add(np.zeros((64, 64, 3), np.uint8))
@@ -602,10 +602,10 @@ def test_a_missing_ray_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_unreachable_address_is_reported_immediately(tmp_path: Path) -> None:
-    """Also where there is no ray to try it with."""
+    """Also if ray is not installed."""
     job: Any = (None, None, 0, None, tmp_path)
     with closing(socket.socket()) as taken:
-        taken.bind(('127.0.0.1', 0))  # and listens not
+        taken.bind(('127.0.0.1', 0))  # and does not listen
         port = taken.getsockname()[1]
         for address in (f'127.0.0.1:{port}', f'ray://127.0.0.1:{port}', 'ray://127.0.0.1:99999'):
             with pytest.raises(LakeError, match=f'no Ray cluster at {address}'):
@@ -613,7 +613,7 @@ def test_an_unreachable_address_is_reported_immediately(tmp_path: Path) -> None:
 
 
 def test_a_worker_with_other_libraries_is_refused(tmp_path: Path) -> None:
-    """Its episodes would have other bytes; the error names what differs, and where."""
+    """Its episodes would differ in bytes; the error names the difference, and the worker."""
     wanted = {**cluster.library_versions(), 'av': '1.0', 'architecture': 'riscv64'}
     with pytest.raises(LakeError, match=rf'has architecture {platform.machine()} instead of riscv64, av .* instead of 1\.0'):
         cluster.Builder().build((), wanted)  # type: ignore[arg-type]
@@ -641,7 +641,7 @@ export(folder, Bucket(StoreSettings(directory=store), BUCKET), {'mission_type': 
 
 
 class Killed(BaseException):
-    """What no handler expects: as little happens afterwards as after a kill."""
+    """An exception without a handler: as after a kill, no cleanup follows."""
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -658,7 +658,7 @@ def two_missions(tmp_path_factory: pytest.TempPathFactory) -> House:
 
 
 def dying(patch: pytest.MonkeyPatch, at: int) -> None:
-    """The process dies when it gives a file its name for the ``at``-th time."""
+    """The process is killed at its ``at``-th rename."""
     real, done = os.replace, 0
 
     def replace(*arguments: Any, **more: Any) -> None:
@@ -693,7 +693,7 @@ def test_a_killed_export_resumes(two_missions: House, tmp_path: Path) -> None:
 
 @pytest.mark.long('an export for each file that it writes')
 def test_after_a_kill_another_process_continues_the_export(two_missions: House, tmp_path: Path) -> None:
-    """With SIGKILL, in an episode and while the dataset is written: another process goes on."""
+    """After SIGKILL, in an episode and while the dataset is written."""
     export(tmp_path / 'whole', two_missions.source, PATROLS, ExportOptions())
     wanted = contents(tmp_path / 'whole')
     for at in (1, 4, 12):
@@ -707,7 +707,7 @@ def test_after_a_kill_another_process_continues_the_export(two_missions: House, 
 
 @pytest.mark.long('an export for each file that it writes')
 def test_a_killed_worker_is_reported(two_missions: House, tmp_path: Path) -> None:
-    """Nothing was added then; the next run gives the same files."""
+    """Nothing was added; the next run gives the same files."""
     export(tmp_path / 'whole', two_missions.source, PATROLS, ExportOptions())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr('shadowhound_data_logger.datasets.export.build', kill_this_process)
@@ -720,7 +720,7 @@ def test_a_killed_worker_is_reported(two_missions: House, tmp_path: Path) -> Non
 
 @pytest.mark.long('an export for each file that it writes')
 def test_a_killed_drop_is_completed(two_missions: House, tmp_path: Path) -> None:
-    """Whoever looks at the dataset next finishes it: nothing of the mission is left."""
+    """The next process that opens the dataset completes it: nothing of the mission is left."""
     export(tmp_path / 'whole', two_missions.source, PATROLS, ExportOptions())
     drop(tmp_path / 'whole', 'm0')
     wanted = contents(tmp_path / 'whole')
@@ -736,7 +736,7 @@ def test_a_killed_drop_is_completed(two_missions: House, tmp_path: Path) -> None
             else:
                 break
         made = resumed(folder)
-        if 'm0' in made.mission_ids:  # before it was noted that it has to go
+        if 'm0' in made.mission_ids:  # before the intent was recorded
             assert at == 1
             continue
         assert contents(folder) == wanted, at

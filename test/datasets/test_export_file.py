@@ -1,4 +1,4 @@
-"""``export lerobot --config``: topics and fields become features; the examples export what such robots recorded."""
+"""``export lerobot --config``: topics and fields become features; the examples export recordings of such robots."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COMMANDS: Final = '/forward_position_controller/commands'
 JOINT_NAMES: Final = ('shoulder', 'elbow', 'wrist')
 BASE: Final = {CAMERA: ('camera', COMPRESSED, 10.0), '/odom': ('odom', ODOMETRY, 50.0), '/cmd_vel': ('cmd_vel', TWIST, 20.0)}
 ARM: Final = {WRIST: ('camera', COMPRESSED, 10.0), '/joint_states': ('joints', JOINTS, 50.0), COMMANDS: ('imu', NUMBERS, 10.0)}
-"""Topic -> the sensor whose settings encode it, its type and rate."""
+"""Topic -> the sensor with the settings for encoding it, its type and rate."""
 
 
 def recorded(folder: Path, topics: dict[str, tuple[str, str, float]]) -> House:
@@ -93,7 +93,7 @@ def values(made: Lerobot, *columns: str) -> list[Any]:
 
 
 def test_a_wheeled_base_is_exported_by_its_file(tmp_path: Path) -> None:
-    """Its numbers are those of the messages at or before each tick, and ``info.json`` says from which topic they are."""
+    """Its numbers are from the messages at or before each tick, and ``info.json`` names their topics."""
     made = exported(recorded(tmp_path, BASE), EXAMPLES / 'export_base.yaml')
     assert made.info['robot_type'] == 'turtlebot4'
     features = made.info['features']
@@ -111,7 +111,7 @@ def test_a_wheeled_base_is_exported_by_its_file(tmp_path: Path) -> None:
 
 
 def test_an_arm_is_exported_by_its_file(tmp_path: Path) -> None:
-    """Names of joints come from the message where the file gives none; images are as they were published."""
+    """Joint names come from the message if the file has none; images are as published."""
     made = exported(recorded(tmp_path, ARM), EXAMPLES / 'export_arm.yaml')
     features = made.info['features']
     assert features['observation.state']['names'] == [f'{name}.pos' for name in JOINT_NAMES]
@@ -124,7 +124,7 @@ def test_an_arm_is_exported_by_its_file(tmp_path: Path) -> None:
 
 
 def test_the_file_of_a_dataset_is_in_it(tmp_path: Path) -> None:
-    """Its settings are those of the dataset: another mapping is refused, and says what differs."""
+    """Its settings are those of the dataset: a different mapping is refused, with the difference."""
     house = recorded(tmp_path, BASE)
     made = exported(house, EXAMPLES / 'export_base.yaml')
     assert made.settings is not None
@@ -182,7 +182,7 @@ def test_a_wrong_file_is_wrong_usage(tmp_path: Path, text: str) -> None:
 
 
 def test_another_number_of_names_is_refused_by_mission(tmp_path: Path) -> None:
-    """The report says how many numbers the field has."""
+    """The report has the field's number of values."""
     house, path = recorded(tmp_path, ARM), tmp_path / 'arm.yaml'
     path.write_text((EXAMPLES / 'export_arm.yaml').read_text().replace('elbow.pos, ', ''))
     with pytest.raises(AssertionError, match='has 3 numbers in data, and 2 names are given'):

@@ -1,4 +1,4 @@
-"""Recordings of an arm by other programs: imported, they are sources like ours; next to a robot they are episodes."""
+"""Recordings of an arm by other programs: once imported, they are sources like ours; next to a robot they are episodes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> House:
 
 
 def begin_ns(number: int) -> int:
-    """Of the arm's recording, by the robot's clock: half a second before the mission."""
+    """The start of the arm's recording, by the robot's clock: half a second before the mission."""
     return Mission('', begin_s=2000.0 * number).begin_ns - SECOND // 2 + 7_000_000
 
 
@@ -51,7 +51,7 @@ def positions(number: int) -> np.ndarray[Any, Any]:
 
 def lerobot_set(folder: Path, version: str, numbers: Sequence[int] = (0, 1), *, fps: int = FPS, dtype: Any = np.float32,
                 change: Callable[[list[np.ndarray[Any, Any]]], object] = lambda _: None, files: int = 1) -> Path:  # fmt: skip
-    """As lerobot lays it out: v2.1 a file an episode, v3.0 all in a file, or in several. In degrees.
+    """In lerobot's layout: v2.1 one file per episode, v3.0 all in one file, or in several. In degrees.
 
     ``numbers`` are the recordings that are its episodes; ``change`` gets their positions.
     """
@@ -73,7 +73,7 @@ def lerobot_set(folder: Path, version: str, numbers: Sequence[int] = (0, 1), *, 
         }))  # fmt: skip
     if version == 'v3.0':
         whole = pa.concat_tables(tables)
-        for number in range(files):  # also where an episode is in two of them
+        for number in range(files):  # also if an episode is in two of them
             begin, end = (len(whole) * each // files for each in (number, number + 1))
             pq.write_table(whole.slice(begin, end - begin), folder / f'data/chunk-000/file-{number:03d}.parquet')
     else:
@@ -90,7 +90,7 @@ def times(tmp_path: Path) -> Path:
 
 
 def exported(house: House, folder: Path, arm: str) -> Lerobot:
-    """Beside the robot, with its clock given by pairs: what was imported has recorded none."""
+    """Exported next to the robot, with its clock given by pairs: the imported data has none."""
     pairs = tuple((stamp, CLOCK.of(stamp)) for number in range(2) for stamp in (begin_ns(number), begin_ns(number) + 3 * SECOND))
     found = export(folder, house.source, {}, ExportOptions(state=('velocity',), arm=arm, clock_pairs=pairs))
     assert (found.refused, found.waiting, len(found.added)) == ({}, {}, 2)
@@ -109,7 +109,7 @@ def assert_is_as_recorded(made: Lerobot) -> None:
 
 @pytest.mark.parametrize('version', [pytest.param('v2.1', marks=pytest.mark.long('as for v3.0')), 'v3.0'])
 def test_a_dataset_of_the_arm_is_imported(house: House, tmp_path: Path, times: Path, version: str) -> None:
-    """As it is, joints in degrees: stored once, in the catalogue, and each value traced to the object and the file."""
+    """Unchanged, joints in degrees: stored once, in the catalog, and each value traced to the object and the file."""
     arm, source = f'arm{version[1]}', lerobot_set(tmp_path / 'theirs', version)
     store = open_store(house.settings, UploadSettings())
     assert import_episodes(read_lerobot(source, read_times(times), is_degrees=True), arm, store).objects == 4
@@ -125,7 +125,7 @@ def test_a_dataset_of_the_arm_is_imported(house: House, tmp_path: Path, times: P
 
 @pytest.mark.long('a second of CPU or more')
 def test_a_dataset_without_a_unit_claims_none(house: House, tmp_path: Path, times: Path) -> None:
-    """The numbers stay as they are, and no unit is claimed."""
+    """The numbers are unchanged, and no unit is recorded."""
     store = open_store(house.settings, UploadSettings())
     import_episodes(read_lerobot(lerobot_set(tmp_path / 'theirs', 'v3.0'), read_times(times), is_degrees=False), 'bare', store)
     made = exported(house, tmp_path / 'set', 'bare')
@@ -152,7 +152,7 @@ def test_demonstrations_in_hdf5_are_imported(house: House, tmp_path: Path, times
 
 
 def test_a_file_that_is_not_a_recording_is_refused(tmp_path: Path, times: Path) -> None:
-    """With what is wrong and what to do; nobody guesses when an episode began."""
+    """With the reason and the remedy; the start of an episode is not guessed."""
     with pytest.raises(LakeError, match='not a LeRobotDataset'):
         list(read_lerobot(tmp_path, {}, is_degrees=False))
     source = lerobot_set(tmp_path / 'theirs', 'v3.0')
@@ -188,7 +188,7 @@ class Shelf:
         return lerobot_set(self.folder / f'theirs{self._count}', version, numbers, **how)
 
     def bring(self, folder: Path, begins: Sequence[int] | None = None, *, is_degrees: bool = True) -> Imported:
-        """``begins`` are the recordings with whose begins its episodes are imported."""
+        """``begins`` are the recordings with the start times for its episodes."""
         times = {episode: begin_ns(number) for episode, number in enumerate(range(9) if begins is None else begins)}
         return import_episodes(read_lerobot(folder, times, is_degrees=is_degrees), 'arm', self.store)
 
@@ -208,7 +208,7 @@ def counts(found: Imported) -> tuple[int, int, int, int]:
 
 @pytest.mark.parametrize('version', ['v2.1', 'v3.0'])
 def test_only_the_new_episodes_of_a_grown_dataset_are_imported(shelf: Shelf, version: str) -> None:
-    """Its shared file was written again: the new episode is added, and what is in the store stays as it is."""
+    """Its shared file was rewritten: the new episode is added, and the store's data is unchanged."""
     assert counts(shelf.bring(shelf.set(version))) == (2, 0, 0, 0)
     before = shelf.contents()
     found = shelf.bring(shelf.set(version, (0, 1, 2)))
@@ -223,13 +223,13 @@ def test_only_the_new_episodes_of_a_grown_dataset_are_imported(shelf: Shelf, ver
 
 @pytest.mark.parametrize(('version', 'how'), [('v2.1', {}), ('v3.0', {'files': 3}), ('v3.0', {'dtype': np.float64})])
 def test_the_layout_does_not_change_an_episode(shelf: Shelf, version: str, how: dict[str, Any]) -> None:
-    """Whatever files the episodes are in, also one episode in two of them, and however wide the columns are."""
+    """Whatever files the episodes are in, also one episode in two of them, and for any column width."""
     assert counts(shelf.bring(shelf.set())) == (2, 0, 0, 0)
     assert counts(shelf.bring(shelf.set(version, **how))) == (0, 2, 0, 0)
 
 
 def test_rows_in_another_order_give_the_same_episode(shelf: Shelf) -> None:
-    """Frames are in the order of their numbers, not of their rows."""
+    """Frames are ordered by number, not by row."""
     shelf.bring(shelf.set())
     folder = shelf.set()
     path = folder / 'data/chunk-000/file-000.parquet'
@@ -239,7 +239,7 @@ def test_rows_in_another_order_give_the_same_episode(shelf: Shelf) -> None:
 
 
 def test_an_episode_that_changed_is_refused(shelf: Shelf) -> None:
-    """By one number: it is named, the others are imported, and the store keeps what it has."""
+    """By one number: it is named, the others are imported, and the store keeps its data."""
     shelf.bring(shelf.set())
     before = shelf.contents()
 
@@ -259,7 +259,7 @@ def test_an_episode_that_changed_is_refused(shelf: Shelf) -> None:
     {'change': lambda states: states.__setitem__(1, states[1][1:])},
 ], ids=['fps', 'cut at its end', 'cut at its begin'])  # fmt: skip
 def test_other_times_are_another_recording(shelf: Shelf, how: dict[str, Any]) -> None:
-    """The same numbers at another rate, or fewer of them."""
+    """The same numbers at a different rate, or fewer of them."""
     shelf.bring(shelf.set())
     found = shelf.bring(shelf.set(**how))
     assert (found.episodes, f'episode 1 ({iso(begin_ns(1))})' in found.refused) == (0, True)
@@ -271,7 +271,7 @@ def test_another_unit_is_another_recording(shelf: Shelf) -> None:
 
 
 def test_removed_episodes_are_reported(shelf: Shelf) -> None:
-    """They stay in the store. One that was removed from the middle: the others have other numbers, and are the same."""
+    """They stay in the store. With one removed from the middle, the others have new numbers, and are the same."""
     shelf.bring(shelf.set(numbers=(0, 1, 2)))
     before = shelf.contents()
     found = shelf.bring(shelf.set(numbers=(0, 2)), begins=(0, 2))
@@ -281,7 +281,7 @@ def test_removed_episodes_are_reported(shelf: Shelf) -> None:
 
 
 def test_episodes_in_another_order_are_the_same(shelf: Shelf) -> None:
-    """With their own begins they are the same; with those of the old numbers they are refused, and nothing is stored twice."""
+    """With their start times they are the same; with those of the old numbers they are refused, and nothing is stored twice."""
     shelf.bring(shelf.set(numbers=(0, 1, 2)))
     before = shelf.contents()
     assert counts(shelf.bring(shelf.set(numbers=(2, 0, 1)), begins=(2, 0, 1))) == (0, 3, 0, 0)
@@ -292,7 +292,7 @@ def test_episodes_in_another_order_are_the_same(shelf: Shelf) -> None:
 
 
 def test_a_merged_dataset_imports_nothing_twice(shelf: Shelf) -> None:
-    """Merged: what was imported of either one is there already."""
+    """Episodes imported from either one exist already."""
     shelf.bring(shelf.set(numbers=(0, 1)), begins=(0, 1))
     shelf.bring(shelf.set(numbers=(2,)), begins=(2,))
     assert counts(shelf.bring(shelf.set(numbers=(2, 0, 1, 3)), begins=(2, 0, 1, 3))) == (1, 3, 0, 0)
@@ -300,7 +300,7 @@ def test_a_merged_dataset_imports_nothing_twice(shelf: Shelf) -> None:
 
 @pytest.mark.parametrize('shift_s', [-1.5, 1.5, 3.9])
 def test_two_recordings_of_the_same_time_are_refused(shelf: Shelf, shift_s: float) -> None:
-    """An arm has one at a time: another one is refused, also in the same dataset, and one after it is taken."""
+    """An arm has one at a time: a second one is refused, also in the same dataset, and a later one is accepted."""
     shelf.bring(shelf.set(numbers=(0,)))
     other = shelf.set(numbers=(3, 4))
     times = {0: begin_ns(0) + round(shift_s * SECOND), 1: begin_ns(0) + 4 * SECOND}
@@ -312,7 +312,7 @@ def test_two_recordings_of_the_same_time_are_refused(shelf: Shelf, shift_s: floa
 
 
 def test_a_killed_import_is_completed(shelf: Shelf) -> None:
-    """Of the second episode there are the joints alone, not the commands and not the rows of the catalogue."""
+    """The second episode only has the joints, not the commands and not the rows of the catalog."""
     folder = shelf.set()
     shelf.bring(folder)
     whole = shelf.contents()
@@ -324,7 +324,7 @@ def test_a_killed_import_is_completed(shelf: Shelf) -> None:
 
 
 def test_a_long_episode_is_one_episode(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is in several objects, and one episode still."""
+    """It is stored in several objects, and is still one episode."""
     monkeypatch.setattr('shadowhound_data_logger.datasets.imports.PART', 50)
     found = shelf.bring(shelf.set())
     assert (found.episodes, found.objects) == (2, 12)
@@ -333,7 +333,7 @@ def test_a_long_episode_is_one_episode(shelf: Shelf, monkeypatch: pytest.MonkeyP
 
 
 def test_numbers_that_are_equal_have_one_identity() -> None:
-    """0 and -0, any NaN, any order of bytes in memory; and not: joints of other names, commands or none."""
+    """0 and -0, any NaN, any byte order in memory; but not: joints with different names, commands or none."""
     stamps = np.arange(3, dtype=np.int64)
     values = np.array([[0.0, 1.0], [2.0, np.nan], [4.0, 5.0]])
     one = identity_of(stamps, ('a', 'b'), values, None, 'rad')
@@ -351,7 +351,7 @@ def test_numbers_that_are_equal_have_one_identity() -> None:
 
 
 def test_a_repeated_frame_is_refused(shelf: Shelf) -> None:
-    """A file of an earlier version lies in the folder still."""
+    """A file of an earlier version is still in the folder."""
     folder = shelf.set(files=2)
     (folder / 'data/chunk-000/file-002.parquet').write_bytes((folder / 'data/chunk-000/file-001.parquet').read_bytes())
     with pytest.raises(LakeError, match='has a frame twice'):
@@ -359,13 +359,13 @@ def test_a_repeated_frame_is_refused(shelf: Shelf) -> None:
 
 
 def test_foreign_objects_are_not_taken_for_an_import(shelf: Shelf) -> None:
-    """Keys that look like ours with a date that is none, what the arm logged itself, and metadata that is no number."""
+    """Keys like ours with an invalid date, the arm's own logs, and metadata that is not a number."""
     shelf.bring(shelf.set(numbers=(0,)))
     root = shelf.settings.directory / 'sensor-data/arm/joint_states'
     for name in ('20269999/999999_000_joint_states_0123456789abcdef_0.json', '20261028/120000_000_joint_states.json'):
         (root / name).parent.mkdir(exist_ok=True)
         (root / name).write_bytes(b'{}')
-    (root / '20261028/115900_000_joint_states_0123456789abcdef_0.json').write_bytes(b'{}')  # begins before; its end is unknown
+    (root / '20261028/115900_000_joint_states_0123456789abcdef_0.json').write_bytes(b'{}')  # starts before; its end is unknown
     found = shelf.bring(shelf.set(numbers=(0, 1)))
     assert counts(found) == (1, 1, 0, 1)
 
@@ -383,7 +383,7 @@ def test_invalid_frame_numbers_are_refused(shelf: Shelf, column: str) -> None:
 
 
 def test_the_command_reports_what_was_refused(shelf: Shelf, tmp_path: Path) -> None:
-    """With exit code 1; what is there already, and what is not there any more, is no finding."""
+    """With exit code 1; existing or removed episodes are not findings."""
     home = tmp_path / 'home'
     home.mkdir()
     (home / 'store').symlink_to(shelf.settings.directory)

@@ -1,4 +1,4 @@
-"""lerobot itself loads what is exported, offline, value by value as it was recorded; where its environment exists."""
+"""LeRobot itself loads exports, offline, with each value as recorded; if its environment exists."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> House:
 
 
 def sources_of(folder: Path, house: House) -> list[Any]:
-    """The picture of each frame, decoded from its source."""
+    """The image of each frame, decoded from its source."""
     store = DirectoryStore(house.settings.directory)
     table = pq.read_table(folder / 'meta/shadowhound_sources.parquet').to_pylist()
     found = []
@@ -80,7 +80,7 @@ def sources_of(folder: Path, house: House) -> list[Any]:
     ids=['av1', 'h264', 'lossless'],
 )
 def test_lerobot_reads_what_was_recorded(house: House, tmp_path: Path, options: ExportOptions) -> None:
-    """Every frame of every kind: numbers as in their sources, pictures as close as the codec keeps them, windows padded right."""
+    """Every frame of every kind: numbers as in their sources, images within the codec's accuracy, windows padded correctly."""
     found = export(tmp_path / 'set', house.source, PATROLS, options)
     assert (found.refused, found.waiting) == ({}, {})
     with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
@@ -107,7 +107,7 @@ def test_lerobot_reads_what_was_recorded(house: House, tmp_path: Path, options: 
 
 
 def test_two_exports_are_merged_by_lerobot(house: House, tmp_path: Path) -> None:
-    """Its own function takes them, and our columns are in the episodes still."""
+    """With its own function, and our columns are still in the episodes."""
     for number in range(2):
         export(tmp_path / f'set{number}', house.source, {'mission': f'm{number}'}, ExportOptions())
     with_lerobot(tmp_path, 'merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
@@ -118,14 +118,14 @@ def test_two_exports_are_merged_by_lerobot(house: House, tmp_path: Path) -> None
 
 
 def test_an_export_passes_verification(house: House, tmp_path: Path) -> None:
-    """After lerobot has read it, too: it changes nothing."""
+    """Also after lerobot has read it: it changes nothing."""
     export(tmp_path / 'set', house.source, PATROLS, ExportOptions())
     with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
 
 
 def test_a_robot_with_its_arm_is_loaded_by_lerobot(tmp_path: Path) -> None:
-    """Two sets of a task, each loaded by lerobot, and merged: the state at every tick is what was written, joint by joint."""
+    """Two datasets of a task, each loaded by lerobot, and merged: the state at every tick is the written one, joint by joint."""
     place = House(tmp_path / 'house')
     for number in range(2):
         record_arm(place, place.record(Mission(f'm{number}', begin_s=100 * number, seconds=2, sensors=('camera', 'odom'))))
@@ -161,9 +161,9 @@ def three(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize('layout', LAYOUTS)
 def test_lerobot_reads_a_dataset_in_every_way(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
-    """By index, with torchcodec and with PyAV; windows in two workers; and streamed, but for a video of each episode.
+    """By index, with torchcodec and with PyAV; windows in two workers; and streamed, except with one video per episode.
 
-    lerobot#4524: where this fails because lerobot can stream them, the layout ``shared`` is not needed any more.
+    lerobot#4524: if this fails because lerobot can stream them, the layout ``shared`` is no longer needed.
     """
     with_lerobot(tmp_path, 'read', str(tmp_path / 'out.json'), str(three[layout]))
     said = json.loads((tmp_path / 'out.json').read_text())
@@ -179,7 +179,7 @@ def test_lerobot_reads_a_dataset_in_every_way(three: dict[str, Path], tmp_path: 
 
 @pytest.mark.parametrize('layout', ['episode', 'shared', 'lossless'])
 def test_lerobots_tools_accept_a_dataset(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
-    """Each frame that is left has its numbers, and its picture as close as another encoding keeps it."""
+    """Each remaining frame has its numbers, and its image within the accuracy of another encoding."""
     with_lerobot(tmp_path, 'tools', str(tmp_path / 'made'), str(three[layout]))
     said = json.loads((tmp_path / 'made/said.json').read_text())
     streamed = said.pop('two files, streamed')
@@ -191,12 +191,12 @@ def test_lerobots_tools_accept_a_dataset(three: dict[str, Path], tmp_path: Path,
     assert max(each['pictures'] for each in said.values()) < 0.02
     assert all(each['pictures'] == 0 for name, each in said.items() if name in {'added', 'removed', 'tasks', 'stats'})
     assert (said['tasks']['tasks'], said['stats']['tasks']) == (['sit'], ['walk 0', 'walk 1'])
-    if layout != 'lossless':  # what lerobot itself puts into two files it cannot stream either
+    if layout != 'lossless':  # lerobot cannot stream what it puts into two files itself either
         assert streamed['wrong'] or streamed['error']
 
 
 def test_lerobots_viewer_shows_a_dataset(three: dict[str, Path], tmp_path: Path) -> None:
-    """Its recording for Rerun has an episode that is in the middle of a shared video."""
+    """Its recording for Rerun contains an episode from the middle of a shared video."""
     with_lerobot(tmp_path, 'view', str(tmp_path / 'shown'), str(three['shared']))
     (path,) = (tmp_path / 'shown').iterdir()
     assert path.name == 'local_set_episode_1.rrd'
@@ -205,7 +205,7 @@ def test_lerobots_viewer_shows_a_dataset(three: dict[str, Path], tmp_path: Path)
 
 
 def test_a_dataset_edited_with_lerobot_keeps_its_episodes(tmp_path: Path) -> None:
-    """An episode is the same after it has grown and after each tool, whatever the files and numbers are now."""
+    """An episode is the same after the dataset has grown and after each tool, whatever the files and numbers are now."""
     with_lerobot(tmp_path, 'arm', str(tmp_path / 'arm'))
     house = House(tmp_path / 'house')
     house.settings.directory.mkdir(parents=True)

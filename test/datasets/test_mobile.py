@@ -1,4 +1,4 @@
-"""The folder of a task: robot and arm at their own rates, what is detected, and how it all belongs together."""
+"""The folder of a task: robot and arm at their original rates, detections, and the relation between them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 @pytest.mark.long('a second of CPU or more')
 def test_what_each_recorded_is_there_at_its_own_rate(task: tuple[Path, Exported]) -> None:
-    """Odometry as any reader of bags reads it, joints of both, the video of the frames."""
+    """Odometry as any bag reader reads it, joints of both, the video of the frames."""
     folder, _ = task
     mission = Mission('', begin_s=100, seconds=2)
     within = [stamp for stamp in mission.stamps('odom') if mission.begin_ns <= stamp <= mission.end_ns]
@@ -72,7 +72,7 @@ def test_what_each_recorded_is_there_at_its_own_rate(task: tuple[Path, Exported]
 
 @pytest.mark.long('a second of CPU or more')
 def test_frames_are_listed_in_a_table(task: tuple[Path, Exported]) -> None:
-    """A row each, with the messages that it was made of, by their own clocks, and the offset."""
+    """One row each, with the messages used for it, by their clocks, and the offset."""
     folder, found = task
     rows = rows_of(folder / 'synchronized/timestamps.csv')
     made = Lerobot(folder / SET)
@@ -87,7 +87,7 @@ def test_frames_are_listed_in_a_table(task: tuple[Path, Exported]) -> None:
 
 
 def test_detections_are_exported_and_a_mission_is_dropped(house: House, tmp_path: Path) -> None:
-    """By episode, with the objects that they came from; nothing of a mission that was dropped is left."""
+    """By episode, with their source objects; a dropped mission leaves nothing behind."""
     mission = Mission('', begin_s=100, seconds=2)
     told: dict[str, Any] = {'samples': [{'stamp_ns': mission.begin_ns + 10, 'detections': [{'id': 'cup'}]}]}
     made = house.drive.one(
@@ -112,7 +112,7 @@ def test_detections_are_exported_and_a_mission_is_dropped(house: House, tmp_path
 
 
 def test_a_mission_id_stays_in_its_folder(tmp_path: Path) -> None:
-    """Its id comes from a store: one that is a way out of the folder is refused, and nothing is removed."""
+    """Its id comes from a store: one that escapes the folder is refused, and nothing is removed."""
     kept = tmp_path / 'kept'
     kept.mkdir()
     for name in ('../../kept', '..', '', str(kept)):

@@ -1,4 +1,4 @@
-"""The bag or the objects from which an episode is made: of the mission's own time, its own bags first."""
+"""The bag or the objects that an episode is made from: within the mission's time, its own bags first."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 LATE_NS = 2_000_000
-"""From a message's stamp to its arrival."""
+"""The delay from a message's stamp to its arrival."""
 EVENT = EventOf('fall', 30.0, 30.0, 10.0, ())
 
 
 class Yard(House):
-    """A store with missions whose objects have one picture in half a second, and with bags."""
+    """A store with missions whose objects have two images per second, and with bags."""
 
     def mission(self, name: str, begin_s: float, seconds: float = 4.0, **more: Any) -> Mission:
-        """Its objects are of its own time, and of a second before and after it."""
+        """Its objects cover its time, and a second before and after it."""
         rates = {'camera_hz': 2.0, 'odom_hz': 4.0, **more}
         made = self.record(Mission(name, begin_s=begin_s, seconds=seconds, sensors=('camera', 'odom'), **rates))
         tell(self.settings, self.folder, *(
@@ -57,7 +57,7 @@ class Yard(House):
 
     def bag(self, name: str, *times_s: tuple[float, float], hz: float = 10.0, mission: MissionOf | None = None,
             event: EventOf | None = None, has_manifest: bool = True) -> str:  # fmt: skip
-        """One slice for each of these times, seconds after noon; the prefix of their keys."""
+        """One slice for each of these times, seconds after noon; returns the prefix of their keys."""
         infos = []
         for number, (first_s, last_s) in enumerate(times_s):
             path = self.folder / slice_file(name, number)
@@ -105,7 +105,7 @@ def told(found: Exported, mission: str, stream: str = 'images.front') -> dict[st
 
 
 def test_missions_that_are_four_seconds_apart_are_separate(yard: Yard) -> None:
-    """Each is made of its own bag, at that bag's rate, though the earlier one has far more messages."""
+    """Each is made from its own bag, at that bag's rate, though the earlier one has far more messages."""
     yard.mission('one', 0)
     yard.mission('two', 8)
     bags = {'one': yard.bag('b1', (0, 4), hz=40, mission=of('one')), 'two': yard.bag('b2', (8, 12), mission=of('two'))}
@@ -119,7 +119,7 @@ def test_missions_that_are_four_seconds_apart_are_separate(yard: Yard) -> None:
 
 
 def test_the_missions_bag_takes_precedence_over_another_one(yard: Yard) -> None:
-    """By the mission's id: a denser bag of no mission, of another one, and of an event in it are left alone."""
+    """By the mission's id: a denser bag of no mission, of another one, and of an event in it are ignored."""
     yard.mission('one', 20)
     own = yard.bag('own', (20, 24), mission=of('one'))
     yard.bag('always', (0, 40), hz=40)
@@ -130,7 +130,7 @@ def test_the_missions_bag_takes_precedence_over_another_one(yard: Yard) -> None:
 
 
 def test_a_bag_with_only_the_run_id_belongs_to_its_mission(yard: Yard) -> None:
-    """While a mission is not known to MLflow its bag may have the id of the run alone."""
+    """While a mission is unknown to MLflow its bag may have only the id of the run."""
     yard.mission('one', 20)
     own = yard.bag('own', (20, 24), mission=MissionOf('patrol', None, 'runone'))
     yard.bag('always', (0, 40), hz=40)
@@ -139,7 +139,7 @@ def test_a_bag_with_only_the_run_id_belongs_to_its_mission(yard: Yard) -> None:
 
 
 def test_each_mission_gets_its_slices_of_a_shared_bag(yard: Yard) -> None:
-    """Each is made of the slices of its own time, whoever's mission it was when the bag began."""
+    """Each is made from the slices of its time, whichever mission was active when the bag started."""
     yard.mission('one', 3)
     yard.mission('two', 13)
     prefix = yard.bag('service', (0, 5), (5.1, 10), (10.1, 15), (15.1, 20), mission=of('one'))
@@ -151,7 +151,7 @@ def test_each_mission_gets_its_slices_of_a_shared_bag(yard: Yard) -> None:
 
 
 def test_a_mission_without_a_bag_uses_the_bag_of_its_neighbor_where_it_has_more(yard: Yard) -> None:
-    """The other one's bag reaches a second into it, with more pictures than all of its objects: these are taken."""
+    """The other bag extends a second into it, with more images than all of its objects: these are used."""
     yard.mission('one', 0)
     yard.mission('two', 5)
     yard.bag('b1', (0, 6), hz=40, mission=of('one'))
@@ -162,7 +162,7 @@ def test_a_mission_without_a_bag_uses_the_bag_of_its_neighbor_where_it_has_more(
 
 
 def test_an_excerpt_does_not_represent_a_mission(yard: Yard) -> None:
-    """An event's bag, and a part of the mission's own one that was requested, have more pictures of less of it."""
+    """An event's bag, and a requested part of the mission's own one, have more images of less of it."""
     yard.mission('one', 20, 6)
     yard.mission('two', 60, 6)
     yard.bag('event', (18, 24), hz=40, mission=of('one'), event=EVENT)
@@ -173,7 +173,7 @@ def test_an_excerpt_does_not_represent_a_mission(yard: Yard) -> None:
 
 
 def test_a_mission_may_be_in_two_bags(yard: Yard) -> None:
-    """The node was started again: the episode has the messages of both, and what no bag has in between is stale."""
+    """The node was restarted: the episode has the messages of both, and ticks without any bag are stale."""
     yard.mission('one', 0, 8)
     parts = [yard.bag('first', (0, 4), mission=of('one')), yard.bag('then', (5, 8), mission=of('one'))]
     found = yard.export(max_stale=0.5)
@@ -184,7 +184,7 @@ def test_a_mission_may_be_in_two_bags(yard: Yard) -> None:
 
 
 def test_the_last_moment_of_a_mission_is_in_another_bag(yard: Yard) -> None:
-    """The node was started again right before the end: what is of the mission is taken however little it is."""
+    """The node was restarted right before the end: the mission's part is used however small it is."""
     yard.mission('one', 0, 6)
     yard.bag('first', (0, 5.3), mission=MissionOf('patrol', None, 'runone'))
     last = yard.bag('last', (5.5, 6), mission=of('one'))
@@ -195,7 +195,7 @@ def test_the_last_moment_of_a_mission_is_in_another_bag(yard: Yard) -> None:
 
 
 def test_an_always_on_bag_has_the_beginning(yard: Yard) -> None:
-    """The mission's own bag begins two seconds late: before it the other one's messages are taken, and none twice."""
+    """The mission's own bag starts two seconds late: before it the other one's messages are used, and none twice."""
     yard.mission('one', 10, 6)
     yard.bag('always', (0, 13), hz=10)
     own = yard.bag('own', (12, 16), mission=of('one'))
@@ -220,7 +220,7 @@ def test_two_bags_of_no_mission_have_each_message_once(yard: Yard) -> None:
 
 @pytest.mark.parametrize('damage', [lambda _: None, lambda path: path.write_bytes(b'{"version": 1}')], ids=['none', 'damaged'])
 def test_a_bag_without_a_manifest_is_not_used(yard: Yard, damage: Callable[[Path], object]) -> None:
-    """Nothing says whose it is or what is in it: the objects are taken."""
+    """Its mission and contents are unknown: the objects are used."""
     yard.mission('one', 10)
     prefix = yard.bag('foreign', (9, 15), hz=40, has_manifest=False)
     damage(yard.settings.directory / 'sensor-data' / prefix / 'manifest.json')
@@ -229,7 +229,7 @@ def test_a_bag_without_a_manifest_is_not_used(yard: Yard, damage: Callable[[Path
 
 
 def test_objects_from_before_a_mission_do_not_count(yard: Yard) -> None:
-    """A sensor had another topic, of which there are more objects in the hour before; the bag has more of the mission."""
+    """A sensor had another topic, with more objects in the hour before; the bag has more of the mission."""
     old = [NOON_NS + round(step * SECOND / 2) for step in range(40)]
     made = [yard.drive.one(COMPRESSED, [stamp], [cdr_of(yard.drive._ros, 'camera', stamp)], rate_hz=1000.0) for stamp in old]
     yard.drive.store([replace(each, metadata={**each.metadata, 'topic': '/old'}) for each in made])
@@ -240,7 +240,7 @@ def test_objects_from_before_a_mission_do_not_count(yard: Yard) -> None:
 
 
 def test_objects_are_used_where_they_have_more_of_the_mission(yard: Yard) -> None:
-    """Its own bag has less in the mission than the objects, and more in the ten seconds before it."""
+    """Its own bag has fewer messages in the mission than the objects, and more in the ten seconds before it."""
     yard.mission('one', 20, camera_hz=20.0, odom_hz=20.0)
     yard.bag('own', (10, 19.5), (20, 24), hz=15, mission=of('one'))
     found = yard.export()
@@ -248,12 +248,12 @@ def test_objects_are_used_where_they_have_more_of_the_mission(yard: Yard) -> Non
     assert found.fps == 20
 
 
-# -- what would be exported ------------------------------------------------------------------------------------------------
+# -- dry runs --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope='module')
 def mixed(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    """A mission that can be exported; four that cannot, each for another reason; one that waits."""
+    """A mission that can be exported; four that cannot, each for a different reason; one that waits."""
     made = Yard(tmp_path_factory.mktemp('mixed'))
     made.mission('good', 0)
     made.record(Mission('blind', begin_s=100, seconds=4, camera_hz=2, odom_hz=4, sensors=('camera', 'odom'), uncounted=('odom',)))
@@ -264,7 +264,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Yard:
 
 
 def test_a_dry_run_counts_what_would_be_exported(mixed: Yard) -> None:
-    """Who is refused for what is known without reading a message is refused in both, for the same reason, and counted once."""
+    """A mission refused without reading a message is refused in both, for the same reason, and counted once."""
     dry = export(mixed.folder / 'dry', mixed.source, {'mission_type': 'patrol'}, ExportOptions(fps=2), is_dry=True)
     real = mixed.export('real', fps=2)
     assert list(dry.streams) == [each['mission_id'] for each in real.added] == ['good']
@@ -303,7 +303,7 @@ def test_the_command_counts_refused_missions(mixed: Yard, tmp_path: Path, more: 
 
 
 def test_a_refused_mission_does_not_settle_the_rate(mixed: Yard) -> None:
-    """``fps: auto`` is the rate of the slowest camera of those that are exported."""
+    """``fps: auto`` is the rate of the slowest camera among the exported missions."""
     mixed.record(Mission('poor', begin_s=500, seconds=4, camera_hz=1, odom_hz=4, sensors=('camera', 'odom'), uncounted=('odom',)))
     flags = {'where': "mission_id in ('good', 'poor')"}
     found = export(mixed.folder / 'rate', mixed.source, flags, ExportOptions())
@@ -311,7 +311,7 @@ def test_a_refused_mission_does_not_settle_the_rate(mixed: Yard) -> None:
 
 
 def test_spans_are_cut_out_of_each_other() -> None:
-    """What is left of a time has nothing of the others, and together with them it has all of it."""
+    """The rest of a time overlaps none of the others, and together with them it covers everything."""
     from shadowhound_data_logger.datasets.series import Interval
 
     rng = np.random.default_rng(5)
@@ -325,7 +325,7 @@ def test_spans_are_cut_out_of_each_other() -> None:
 
 
 def record_bag(house: House, tmp_path: Path, *, is_there: bool = True) -> tuple[Mission, str]:
-    """A dense recording beside the objects, and the key of its slice, which a robot may keep."""
+    """A dense recording next to the objects, and the key of its slice, which a robot may keep."""
     dense = Mission('bagged', seconds=2, camera_hz=10.0, odom_hz=50.0)
     path = tmp_path / 'bagged_0.mcap'
     writer = SliceWriter(path)
@@ -344,7 +344,7 @@ def record_bag(house: House, tmp_path: Path, *, is_there: bool = True) -> tuple[
 
 
 def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
-    """The camera at its own rate of a bag, its sources the slices, and all of it proved."""
+    """The camera at its full rate in a bag, its sources the slices, all of them verified."""
     house = House(tmp_path)
     mission = house.record(Mission('bagged', seconds=2, camera_hz=1.0, odom_hz=2.0, sensors=('camera', 'odom')))
     dense, key = record_bag(house, tmp_path)
@@ -378,7 +378,7 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
 
 
 def test_slices_that_a_robot_keeps_are_not_missed(tmp_path: Path) -> None:
-    """The store has the manifest of the bag alone: the dataset is made of the objects."""
+    """The store only has the manifest of the bag: the dataset is made from the objects."""
     house = House(tmp_path)
     house.record(Mission('bagged', seconds=2, camera_hz=5.0, odom_hz=5.0, sensors=('camera', 'odom')))
     record_bag(house, tmp_path, is_there=False)
@@ -388,7 +388,7 @@ def test_slices_that_a_robot_keeps_are_not_missed(tmp_path: Path) -> None:
 
 
 def test_what_an_imu_marks_as_unknown_is_nan_in_a_bag_as_well() -> None:
-    """As in an object: a set is not made of an orientation that the IMU does not measure."""
+    """As in an object: an orientation that the IMU does not measure is not used."""
     types = get_typestore(Stores.ROS2_HUMBLE).types
     vector, covariance = types['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0), np.zeros(9)
     header = types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](1, 0), '')

@@ -1,4 +1,4 @@
-"""What a tick has of a stream: never anything later, nothing across a gap, and velocities as the robot saw them."""
+"""The values of a tick: never anything later, nothing across a gap, and velocities in the robot's frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shadowhound_data_logger.datasets.ticks import interpolated, motion, sample
 
 
 def stream(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Messages at 20 Hz that come irregularly, with two gaps; their numbers; ticks at 30 Hz."""
+    """Irregular messages at 20 Hz, with two gaps; their numbers; ticks at 30 Hz."""
     rng = np.random.default_rng(seed)
     even = np.arange(400) * SECOND // 20 + rng.integers(0, SECOND // 30, 400)
     stamps = np.sort(even[(even < 4 * SECOND) | (even > 7 * SECOND)])
@@ -20,7 +20,7 @@ def stream(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize('seed', range(5))
 def test_a_value_does_not_depend_on_what_comes_later(seed: int) -> None:
-    """Held or interpolated: with all later messages taken away, it is the same."""
+    """Held or interpolated: without all later messages, it is the same."""
     stamps, values, ticks = stream(seed)
     held = sample(stamps, ticks, SECOND // 10)
     _, earlier = interpolated(stamps, values, ticks, SECOND)
@@ -52,7 +52,7 @@ def test_nothing_is_interpolated_across_a_gap() -> None:
 
 
 def test_velocities_are_those_of_a_circle() -> None:
-    """Ahead by speed, not to the side, turning evenly; through the border of an angle, and not across a gap."""
+    """Forward at constant speed, not sideways, turning evenly; across the wrap of an angle, and not across a gap."""
     speed, rate = 0.6, 0.8
     stamps = np.delete(np.arange(200) * SECOND // 20, slice(80, 120))
     yaw = rate * stamps / SECOND + 2.5

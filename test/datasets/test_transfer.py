@@ -1,4 +1,4 @@
-"""A dataset on its way to a SeaweedFS and back, killed and begun again: whole or not there, and nothing is sent twice."""
+"""A dataset transferred to SeaweedFS and back, killed and restarted: complete or missing, and nothing is sent twice."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def die(what: str, at: int, folder: Path, url: str, environ: dict[str, str]) -> 
 
 
 def test_a_dataset_is_complete_or_missing(tmp_path: Path, seaweed: Tower) -> None:
-    """Killed at the first file, in the middle and before ``info.json``; then only what is missing is moved."""
+    """Killed at the first file, in the middle and before ``info.json``; then only missing files are transferred."""
     house = House(tmp_path)
     house.record(Mission('only', seconds=2, sensors=('camera', 'odom')))
     made = tmp_path / 'set'

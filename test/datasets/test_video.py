@@ -1,4 +1,4 @@
-"""One file for each episode's video or one for all of them: the same frames, added to and taken from in the same way."""
+"""One file for each episode's video or one for all of them: the same frames, with the same results of adding and dropping."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shadowhound_data_logger.stores.directory import DirectoryStore
 KEY = 'observation.images.front'
 VIDEO = f'videos/{KEY}/chunk-000/file-000.mp4'
 SECONDS = (1.0, 2.0, 1.5)
-"""At 10 frames a second these are 11, 21 and 16 frames: the first of an episode is at an odd place, too."""
+"""At 10 frames per second these are 11, 21 and 16 frames: the first of an episode is at an odd position, too."""
 
 
 @pytest.fixture(scope='module')
@@ -42,7 +42,7 @@ def exported(house: House, folder: Path, *missions: str, layout: str = SHARED, c
 
 
 def assert_same_frames(one: Lerobot, other: Lerobot) -> None:
-    """Of each mission that the first one has, in sequence and out of it."""
+    """For each mission of the first one, in sequence and out of order."""
     for row in one.rows:
         mine = list(one.images(row, KEY))
         (theirs,) = [each for each in other.rows if each['shadowhound/mission_id'] == row['shadowhound/mission_id']]
@@ -60,7 +60,7 @@ def plain(house: House) -> Lerobot:
 
 @pytest.mark.parametrize('codec', [AV1, pytest.param(H264, marks=pytest.mark.long('the same with another codec'))])
 def test_one_video_has_the_frames_of_all_episodes(house: House, tmp_path: Path, codec: str) -> None:
-    """As they were encoded: a frame's place in the file is its number in the dataset, which is what lerobot streams by."""
+    """As encoded: the position in the file is the frame's number in the dataset, by which lerobot streams."""
     made = exported(house, tmp_path / 'set', codec=codec)
     own = exported(house, tmp_path / 'own', layout='episode', codec=codec)
     assert [path.name for path in sorted((tmp_path / 'set').rglob('*.mp4'))] == ['file-000.mp4']
@@ -73,7 +73,7 @@ def test_one_video_has_the_frames_of_all_episodes(house: House, tmp_path: Path, 
 
 
 def test_episodes_added_later_give_the_same_bytes(house: House, tmp_path: Path, plain: Lerobot) -> None:
-    """Three at once or one after the other: the same bytes; and those that were there stay in their places."""
+    """Three together or one after the other: the same bytes; and existing ones keep their positions."""
     exported(house, tmp_path / 'once')
     first = exported(house, tmp_path / 'then', 'm0')
     rows = list(first.rows)
@@ -88,7 +88,7 @@ def test_episodes_added_later_give_the_same_bytes(house: House, tmp_path: Path, 
 def test_a_dropped_episode_leaves_the_bytes_of_a_dataset_that_never_had_it(
     house: House, tmp_path: Path, plain: Lerobot, mission: str
 ) -> None:
-    """Its frames are gone from the file, and the others are what they were, with the bytes of a set that never had it."""
+    """Its frames are gone from the file, and the others are unchanged, with the bytes of a dataset that never had it."""
     exported(house, tmp_path / 'set')
     drop(tmp_path / 'set', mission)
     made = Lerobot(tmp_path / 'set')
@@ -113,14 +113,14 @@ def test_a_dataset_keeps_its_layout(house: House, tmp_path: Path) -> None:
 
 
 def test_a_later_setting_differs_from_that_of_the_dataset(house: House, tmp_path: Path) -> None:
-    """One that is given later only differs as well as one that is given no more."""
+    """A setting added later differs, and so does one that is no longer given."""
     exported(house, tmp_path / 'set', 'm0')
     with pytest.raises(LakeError, match='was created with labels none'):
         export(tmp_path / 'set', house.source, {'mission': 'm1'}, ExportOptions(layout=SHARED, labels=True))
 
 
 def test_a_dataset_with_shared_videos_is_uploaded_and_fetched(house: House, tmp_path: Path, plain: Lerobot) -> None:
-    """Of an episode that is added the one video is uploaded again, as a whole."""
+    """After an episode is added, only the shared video is uploaded again, completely."""
     store, place = DirectoryStore(house.settings.directory), DatasetPlace.of(f's3://lerobot/datasets/go2/{tmp_path.name}')
     exported(house, tmp_path / 'set', 'm0', 'm1')
     upload(tmp_path / 'set', place, store)
@@ -141,7 +141,7 @@ def test_a_task_has_a_video_of_each_mission(house: House, tmp_path: Path, plain:
 
 
 def test_kept_images_are_marked_as_images(house: House, tmp_path: Path) -> None:
-    """Without that, the ``datasets`` library takes them for bytes where it streams; also after a drop."""
+    """Otherwise the ``datasets`` library takes them for bytes when it streams; also after a drop."""
     export(tmp_path / 'set', house.source, {'mission': 'm'}, ExportOptions(is_lossless=True))
     for _ in range(2):
         made = Lerobot(tmp_path / 'set')
@@ -152,7 +152,7 @@ def test_kept_images_are_marked_as_images(house: House, tmp_path: Path) -> None:
 
 
 def test_videos_that_cannot_be_joined_are_refused(house: House, tmp_path: Path, plain: Lerobot) -> None:
-    """Videos of another codec, and one that has fewer frames than it should."""
+    """Videos with a different codec, and one with fewer frames than it should have."""
     other = exported(house, tmp_path / 'other', 'm1', layout='episode', codec=H264)
     clips = [plain.clip(plain.rows[0], KEY), other.clip(other.rows[0], KEY)]
     with (
@@ -170,7 +170,7 @@ def test_videos_that_cannot_be_joined_are_refused(house: House, tmp_path: Path, 
 @pytest.mark.long('an export for each file that it writes')
 @pytest.mark.parametrize('layout', [SHARED, 'episode'])
 def test_a_killed_append_resumes(house: House, tmp_path: Path, layout: str) -> None:
-    """At each file that adding an episode writes; and what was in the set before can be read in between."""
+    """At each file that adding an episode writes; and the earlier episodes can be read in between."""
     exported(house, tmp_path / 'whole', 'm0', 'm1', layout=layout)
     wanted = contents(tmp_path / 'whole')
     for at in range(1, 100):
@@ -195,7 +195,7 @@ def test_a_killed_append_resumes(house: House, tmp_path: Path, layout: str) -> N
 @pytest.mark.long('a drop for each file that it writes')
 @pytest.mark.parametrize('mission', ['m0', 'm1'])
 def test_a_killed_drop_from_a_shared_video_is_completed(house: House, tmp_path: Path, mission: str) -> None:
-    """Whoever looks at the dataset next finishes it: the file has the frames of the others, once."""
+    """The next process that opens the dataset completes it: the file has the frames of the others, once."""
     exported(house, tmp_path / 'whole')
     drop(tmp_path / 'whole', mission)
     wanted = contents(tmp_path / 'whole')
