@@ -213,7 +213,7 @@ def _check_names(source: Any, robot: str, flags: Mapping[str, Any], bag: str | N
 
     kept = lake.known(source, robot, KeptFilter(), left_out)
     if bag is None:
-        names.check_names(source, left_out, kept, **{**flags, 'robot': robot})
+        names.check_names(source, left_out, **{**flags, 'robot': robot})
     elif not {'*', '?'} & {*bag}:
         prefix = f'{robot}/rosbags/'
         keys = [key.removeprefix(prefix) for key in kept['key'].to_pylist() if key.startswith(prefix)]

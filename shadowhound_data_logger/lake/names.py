@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import Any, Final
 
-import pyarrow as pa
-
 from shadowhound_data_logger.core.errors import UnknownName
+from shadowhound_data_logger.formats.rows.catalog import KEPT
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import robots
+from shadowhound_data_logger.lake.tables import answer, literal
+from shadowhound_data_logger.lake.views import views
 
 MAX_SUGGESTIONS: Final = 10
 """Names in a remedy."""
@@ -56,11 +57,10 @@ def misspelled(query: str, error: str, known: Iterable[str]) -> str:
     return ''
 
 
-def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None, **flags: Any) -> None:
-    """Raises UnknownName for the first name in the flags of ``lake.objects`` that the catalog does not have.
+def check_names(source: Bucket, findings: Findings, **flags: Any) -> None:
+    """Raises UnknownName for the first name in the flags of ``lake.objects`` that neither stored nor kept objects have.
 
-    Names in ``kept``, rows of what robots keep, exist as well. Reads the names of all objects of the robot, so call it only after
-    an empty result. Raises StoreError, LakeError.
+    Reads the names of all objects of the robot, so call it only after an empty result. Raises StoreError, LakeError.
     """
     from shadowhound_data_logger.lake import labels, query  # noqa: PLC0415 - imports names
 
@@ -72,9 +72,8 @@ def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None
         columns += ['mission_id', 'run_id']
     if columns:
         found = query.objects(source, findings=findings, robot=robot, columns=columns, distinct=True).to_pydict()
-        known: dict[str, list[str | None]] = {
-            name: [*found[name], *(kept[name].to_pylist() if kept is not None else ())] for name in columns
-        }
+        kept = _kept(source, findings, robot, columns)
+        known: dict[str, list[str | None]] = {name: [*found[name], *kept[name]] for name in columns}
         for name in _COLUMNS:
             if name in known:
                 check_name_of(name.replace('_', ' '), flags[name], known[name])
@@ -90,3 +89,11 @@ def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None
         versions = [each.partition('#')[0] for each in ids if each]
         if not any('#' in flags['policy'] and each.startswith(flags['policy']) for each in ids if each):
             check_name_of('policy', flags['policy'], [*versions, *(each.partition('@')[0] for each in versions)])
+
+
+def _kept(source: Bucket, findings: Findings, robot: str | None, columns: Sequence[str]) -> dict[str, list[str | None]]:
+    """The names of objects that are only on robots."""
+    with views(source, [KEPT], findings, robot=robot) as ready:
+        of_robot = f' WHERE robot = {literal(robot)}' if robot else ''
+        rows = answer(ready, f'SELECT DISTINCT {", ".join(columns)} FROM all_kept{of_robot}')  # noqa: S608 - own names
+    return {name: rows[name].to_pylist() for name in columns}
