@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -159,7 +159,7 @@ def _sensor(one: WatchedTopic, named: Mapping[str, tuple[SensorSettings, str, st
     if sensor is not None and sensor.name in taken:
         return None, f'the sensor {sensor.name} takes another topic'
     if sensor is not None and one.type in alternatives(allowed):
-        return sensor, ''
+        return replace(sensor, enabled=True), ''
     if why := not_logged(one.topic, one.type, graph):
         return None, why
     latched = all(each.transient_local for each in one.publishers)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import Any, Final
 
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import UnknownName
 from shadowhound_data_logger.formats.rows.catalog import KEPT
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -75,7 +76,7 @@ def check_names(source: Bucket, findings: Findings, **flags: Any) -> None:
         kept = _kept(source, findings, robot, columns)
         known: dict[str, list[str | None]] = {name: [*found[name], *kept[name]] for name in columns}
         for name in _COLUMNS:
-            if name in known:
+            if name in known and not (name == 'sensor' and flags[name] in DEFAULT_SENSORS):  # one of these may have nothing yet
                 check_name_of(name.replace('_', ' '), flags[name], known[name])
         if flags.get('mission'):
             ids = [*known['mission_id'], *known['run_id']]

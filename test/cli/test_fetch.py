@@ -59,8 +59,7 @@ def test_objects_are_fetched_by_query(home: Path) -> None:
     told = json.loads(run(home, '--sensor', 'odom', '--since', '2026-10-28T12:00:01', '--limit', '2', '--json').output)
     assert (told['asked'], told['moved']) == (2, 2)
     assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])
-    assert 'No objects in the bucket sensor-data' in run(home, '--sensor', 'odom', '--until', '2020-01-01').output
-    assert isinstance(run(home, '--sensor', 'lidar').exception, BadUsage)
+    assert 'No objects in the bucket sensor-data' in run(home, '--sensor', 'lidar').output
     assert 'No objects under thor/lidar/ in the bucket x' in run(home, 'thor/lidar/', '--bucket', 'x').output
 
 
