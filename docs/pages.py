@@ -356,8 +356,8 @@ def _described() -> dict[str, str]:
     for prefix, kind in ((SENSOR, SensorSettings), *GROUPS.items()):
         for spec in fields(kind):
             if spec.metadata:
-                name, told = f'{prefix}.{spec.name}', [*_allowed(spec), *(['**live**'] if spec.metadata['live'] else [])]
-                rows[name] = _item(name, _shown(_default(spec)), ' '.join((spec.metadata['help'], *told)))
+                name, notes = f'{prefix}.{spec.name}', [*_allowed(spec), *(['**live**'] if spec.metadata['live'] else [])]
+                rows[name] = _item(name, _shown(_default(spec)), ' '.join((spec.metadata['help'], *notes)))
     return rows
 
 
