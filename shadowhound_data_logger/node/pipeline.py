@@ -232,7 +232,8 @@ class Pipeline:
         others = [name for name, own in DEFAULT_SENSORS.items() if name not in listed and own.get('enabled', True)]
         others = others if has_go2_messages(os.environ) else []
         left_out = f'; not logged, because sensors does not list them: {", ".join(others)}' if others else ''
-        return f'logging {" ".join(self.intake.topics)} to {self._store.describe()}, spool {self.spool.root}{left_out}'
+        topics = ' '.join(self.intake.topics) or ('no topic' if self.intake.found is None else 'topics as they are found')
+        return f'logging {topics} to {self._store.describe()}, spool {self.spool.root}{left_out}'
 
     def close(self) -> None:
         """Close the open batches, make all durable, upload for at most ``shutdown.drain_s``, leave the rest in the spool."""
