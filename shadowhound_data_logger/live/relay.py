@@ -51,7 +51,9 @@ MAX_HEAD: Final = 1 << 20
 MAX_LANES: Final = 64
 MAX_TOPICS: Final = 2000
 _SERIES: Final = {'field', *(kind.name for kind in KINDS.values() if not kind.is_bulk)}
-_SHOWN: Final = {'topics', 'figures', 'pong', 'message', 'problem', *_SERIES, *BULK, *(kind.name for kind in KINDS.values())}
+_SHOWN: Final = {'topics', 'figures', 'sample', 'pong', 'message', 'problem', *_SERIES, *BULK, *(
+    kind.name for kind in KINDS.values()
+)}  # fmt: skip
 _BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, DataLoggerError, TypeError, AttributeError,
                   RecursionError)  # fmt: skip
 _NOT_SIGNED_IN: Final = {
@@ -255,6 +257,8 @@ class _Connection:
         head['at'] = round(at, 1)
         if kind == 'figures' and not _is_figures(head['figures']):
             raise ValueError('its values are invalid')
+        if kind == 'sample' and not _is_sample(head):
+            raise ValueError('its sample is invalid')
         _check(kind, head, body)
         if kind in _SERIES:
             rows = int(head['rows'])
@@ -287,6 +291,12 @@ def _is_figures(told: Any) -> bool:
     """Whether a page can draw these values."""
     rows = told['topics']
     return isinstance(rows, list) and all(isinstance(row['topic'], str) and isinstance(row['type'], str) for row in rows)
+
+
+def _is_sample(head: Mapping[str, Any]) -> bool:
+    """Whether a page can show the rate, size and age of a topic."""
+    numbers = (head.get(name) for name in ('hz', 'bytes', 'age_s', 'seconds', 'messages'))
+    return isinstance(head['of'], str) and all(each is None or isinstance(each, (int, float)) for each in numbers)
 
 
 def _catalog(topics: list[list[Any]], problem: str, total: int = 0) -> LiveItem:

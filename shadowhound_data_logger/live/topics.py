@@ -1,8 +1,9 @@
 """The watched topics, read raw and polled. Importing this loads rclpy.
 
 A subscription exists as long as its topic is watched: as a drawing (``/imu``), as a tree (``/imu#``), or as a number
-(``/imu#orientation.w``). All are BEST_EFFORT and shallow, whatever the publisher offers: no publisher waits for the live page or
-resends for it. Only latched topics (maps, static transforms) are subscribed to as offered.
+(``/imu#orientation.w``); ``/imu#?`` has it sampled for the table (``sampling.py``). All are BEST_EFFORT and shallow, whatever the
+publisher offers: no publisher waits for the live page or resends for it. Only latched topics (maps, static transforms) are
+subscribed to as offered.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.live.kinds import KINDS, Kind, LiveItem, clouds, frames, series, table_item
 from shadowhound_data_logger.live.panels import Maker, kind_of, panel_of
+from shadowhound_data_logger.live.sampling import Sampler
 from shadowhound_data_logger.live.trees import numbers, parsed, tree
 from shadowhound_data_logger.live.viewers import Graph
 from shadowhound_data_logger.ros.endpoints import Plan
@@ -52,6 +54,8 @@ RATE_S: Final = 4.0
 TREE, FIELD = Kind('message', 2.0, is_bulk=True), Kind('field', 20.0, is_bulk=False)
 _Wanted = Mapping[str, frozenset[int]]
 """Watched keys (a topic, with ``#`` as a tree, with ``#path`` one of its numbers) -> the sizes."""
+_SAMPLED: Final = '#?'
+"""Suffix of a key whose topic is sampled."""
 
 
 class _View:
@@ -148,6 +152,7 @@ class Topics:
         self._wanted, self._on_graph, self._on_items = wanted, on_graph, on_items
         self._types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         self._node: Node | None = None
+        self._sampler: Sampler | None = None
         self._guard: PortGuard | None = None
         self._graph: Graph = {}
         self._total = self._counted = 0
@@ -166,6 +171,7 @@ class Topics:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         with without_our_profile(os.environ), dead_ports_avoided(get_default_context().get_domain_id()):
             self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
+        self._sampler = Sampler(self._node, self._on_items)
         self._guard = PortGuard()
         self.worker.start()
 
@@ -180,6 +186,8 @@ class Topics:
             log.warning('the thread that reads topics does not stop')
         for one in self._watched.values():
             one.reader.close()
+        if self._sampler is not None:
+            self._sampler.close()
         if self._node is not None:
             self._node.destroy_node()
         rclpy.try_shutdown()
@@ -210,6 +218,8 @@ class Topics:
             self._follow(wanted)
             self._followed = wanted
         self._drain(wanted, now_s)
+        assert self._sampler is not None
+        self._sampler.step(now_s)
 
     def _check_graph(self) -> None:
         assert self._node is not None
@@ -238,11 +248,14 @@ class Topics:
 
     def _follow(self, wanted: _Wanted) -> None:
         assert self._node is not None
+        assert self._sampler is not None
+        sampled = (key.removesuffix(_SAMPLED) for key in wanted if key.endswith(_SAMPLED))
+        self._sampler.follow({topic: self._graph[topic][0] for topic in sampled if topic in self._graph})
         topics: dict[str, set[str]] = {}
         for key, sizes in wanted.items():
             topic = key.partition('#')[0]
             type_name, _ = self._graph.get(topic, ('', 0))
-            if sizes and type_name and ('#' in key or kind_of(topic, type_name)):
+            if not key.endswith(_SAMPLED) and sizes and type_name and ('#' in key or kind_of(topic, type_name)):
                 topics.setdefault(topic, set()).add(key)
         for topic, one in list(self._watched.items()):
             type_name, publishers = self._graph.get(topic, ('', 0))

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 MAX_VIEWERS: Final = 16
 MAX_MESSAGE: Final = 16 << 10
 """Maximum size of a viewer's message."""
-MAX_WATCHED: Final = 32
+MAX_WATCHED: Final = 40
 """Topics that one viewer watches."""
 REWATCH_S: Final = 0.1
 """Minimum interval between changes of what is read, when viewers choose."""
@@ -160,11 +160,11 @@ class Viewers:
         self.rewatch()
 
     def on_items(self, items: Iterable[LiveItem]) -> None:
-        """Messages of watched topics."""
+        """Messages of watched topics, and samples of topics for all viewers."""
         for item in items:
             self._keep(item)
             for one in self.connected:
-                if item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size:
+                if not item.topic or (item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size):
                     one.tell(item)
             self._cameras.offer(item)
 

@@ -294,6 +294,7 @@ PONG = WHOLE + LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed
         WHOLE + LiveItem('', 'figures', head={'at': 1.0, 'figures': figures}).packed
         for figures in (None, 7, {}, {'topics': 7}, {'topics': [7]}, {'topics': [{'topic': {}, 'type': ''}]})
     ),
+    *(WHOLE + LiveItem('', 'sample', head={'at': 1.0, **head}).packed for head in ({}, {'of': 7}, {'of': '/a', 'hz': {}})),
     *(
         WHOLE + LiveItem('/a', 'cloud', head={**CLOUD, **changed}).packed
         for changed in ({'points': 10**9}, {'low': [math.nan] * 3}, {'low': []}, {'step': [1.0, 1.0, math.inf]}, {'frame': 7})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -33,6 +34,7 @@ class Tab:
         self.told: dict[str, tuple[str, str, int]] = {}
         self.heads: dict[str, dict[str, Any]] = {}
         self.at: dict[str, set[float]] = {}
+        self.samples: dict[str, dict[str, Any]] = {}
 
     async def watch(self, *topics: str) -> None:
         """Watch exactly these; a hidden tab watches none."""
@@ -48,6 +50,8 @@ class Tab:
                 elif head['topic']:
                     self.heads[head['topic']] = head
                     self.at.setdefault(head['topic'], set()).add(head['at'])
+                elif head['kind'] == 'sample':
+                    self.samples[head['of']] = head
                 elif head['kind'] == 'figures':  # each second, in which a page sends something too
                     await self._ws.send_json({'ping': 1})
             if (said := frames.acknowledgement()) is not None:
@@ -264,5 +268,115 @@ def test_what_was_published_once_is_shown_to_all_who_come_later(tmp_path: Path, 
             found.node.create_publisher(OccupancyGrid, '/later', latched).publish(message)
             await until(lambda: '/later' in first.heads, 'the later map is shown')
         assert waiting is not None
+
+    run(tmp_path, monkeypatch, doing)
+
+
+def test_topics_of_the_table_are_sampled_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has rate, mean size and age after a few seconds, for all viewers, with at most two subscriptions at a time.
+
+    Small messages, many, large, best effort, and from a publisher that sends nothing; none is subscribed to before or after.
+    """
+
+    async def doing(found: Robot) -> None:
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+        from rclpy.serialization import serialize_message
+        from sensor_msgs.msg import Image, Imu
+        from std_msgs.msg import Float32
+
+        effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        for topic, kind, profile in (('/slow', Float32, 1), ('/fast', Imu, effort), ('/none', Float32, 1)):
+            found.publishers[topic] = found.node.create_publisher(kind, topic, profile)
+        sent = {
+            '/slow': (5.0, Float32()),
+            IMU: (20.0, Imu()),
+            '/fast': (200.0, Imu()),
+            RAW_IMAGE: (10.0, Image(data=bytes(1 << 20))),
+        }
+        most: list[int] = []
+
+        def publish() -> None:
+            """Each as often as it should be by now."""
+            passed_s = time.monotonic() - began_s
+            for topic, (hz, message) in sent.items():
+                while counts[topic] < passed_s * hz:
+                    found.publishers[topic].publish(message)
+                    counts[topic] += 1
+            most.append(len(found.read()))
+
+        async with found.tab() as first, found.tab() as second:
+            await until(lambda: {'/slow', '/fast', '/none'} <= {*first.topics}, 'the topics are found')
+            assert found.read() == {}
+            await first.watch(*(f'{topic}#?' for topic in (*sent, '/none')))
+            began_s, counts = time.monotonic(), dict.fromkeys(sent, 0)
+            await until(lambda: (publish(), len(first.samples) == 5)[1], 'all are sampled', every_s=0.002)
+            for topic, (hz, message) in sent.items():
+                sample = first.samples[topic]
+                assert hz * 0.7 < sample['hz'] < hz * 1.3, sample
+                assert abs(sample['bytes'] - len(serialize_message(message))) < 4
+                assert 0 <= sample['age_s'] < 1.5 / hz + 0.5
+                assert not sample['latched']
+            assert first.samples[RAW_IMAGE]['messages'] < 15, 'large messages are few'
+            silent = first.samples['/none']
+            assert (silent['messages'], silent['hz'], silent['bytes'], silent['age_s']) == (0, None, None, None)
+            assert max(most) == 2
+            assert {**second.samples, **first.samples} == second.samples
+            await first.watch()
+            await until(lambda: found.read() == {}, 'nobody needs them', SOON_S)
+
+    run(tmp_path, monkeypatch, doing)
+
+
+def test_a_latched_topic_has_no_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its size, and the age of the message that its publisher keeps; that message is received once."""
+
+    async def doing(found: Robot) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from std_msgs.msg import Float32
+
+        latched = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        found.publishers['/once'] = found.node.create_publisher(Float32, '/once', latched)
+        for _ in range(5):
+            found.publishers['/once'].publish(Float32())
+        sent_s = time.monotonic()
+        async with found.tab() as tab:
+            await until(lambda: '/once' in tab.topics, 'the topic is found')
+            await tab.watch('/once#?')
+            ends: set[float] = set()
+            while len(ends) < 2:
+                await until(lambda: '/once' in tab.samples, 'it is sampled')
+                sample = tab.samples.pop('/once')
+                ends.add(sample['at'])
+                assert (sample['latched'], sample['messages'], sample['hz'], sample['bytes']) == (True, 0, None, 8)
+                assert abs(sample['at'] / 1e3 - sample['age_s'] - sent_s) < 0.5
+
+    run(tmp_path, monkeypatch, doing)
+
+
+def test_why_a_topic_cannot_be_sampled_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once for all viewers, and the others are sampled."""
+    from shadowhound_data_logger.live import sampling
+
+    class Reader(sampling.Reader):
+        def __init__(self, node: Any, plan: Any, group: Any) -> None:
+            if plan.topic == OTHER:
+                raise sampling.TypeUnavailable('its message package is not installed here')
+            super().__init__(node, plan, group)
+
+    monkeypatch.setattr(sampling, 'Reader', Reader)
+
+    async def doing(found: Robot) -> None:
+        from sensor_msgs.msg import Imu
+
+        async with found.tab() as tab:
+            await tab.watch(f'{OTHER}#?', f'{IMU}#?')
+
+            def came() -> bool:
+                found.publishers[IMU].publish(Imu())
+                return {OTHER, IMU} <= {*tab.samples}
+
+            await until(came, 'both are reported', every_s=0.05)
+            assert tab.samples[OTHER]['why'] == 'its message package is not installed here'
+            assert tab.samples[IMU]['hz'] > 5
 
     run(tmp_path, monkeypatch, doing)

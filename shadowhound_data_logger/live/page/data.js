@@ -1,14 +1,14 @@
 // The data: topics with the ledger's figures, queue, spool, delivery, findings, and the buttons of an operator.
-import { html, signal, useState } from './vendor/preact.js';
+import { html, signal, useEffect, useRef, useState } from './vendor/preact.js';
 import { Message, inspected, measured } from './message.js';
-import { total, topics } from './state.js';
+import { total, topics, useItems, useWatch } from './state.js';
 import { unseen } from './losses.js';
 import { digits, span, volume } from './words.js';
 
 const COLUMNS = [
-  ['rate', 'Hz', 'Messages per second: as the node counts them, or while the topic’s message is shown'], ['size', 'Size', 'Bytes of the newest message, serialized; of a topic that is not logged, while its message is shown'],
-  ['received', 'Received', 'Messages that the node received since it first ran'], ['stored', 'Stored', 'Messages that are in objects, delivered or waiting'],
-  ['missed', 'Missed', 'Messages that were published and did not reach the node; ~ is an estimate'], ['age', 'Age', 'Seconds since the newest message'],
+  ['rate', 'Hz', 'Messages per second: as the node counts them, or in a sample of a topic that is not logged'], ['size', 'Size', 'Bytes of the newest message, serialized; of a topic that is not logged, the mean of a sample'],
+  ['age', 'Age', 'Seconds since the newest message; of a topic that is not logged, at the end of its sample'], ['received', 'Received', 'Messages that the node received since it first ran'], ['stored', 'Stored', 'Messages that are in objects, delivered or waiting'],
+  ['missed', 'Missed', 'Messages that were published and did not reach the node; ~ is an estimate'],
 ];
 const MARKS = { good: ['●', 'as it should be'], watch: ['▲', 'needs a look'], bad: ['■', 'something is wrong'], none: ['○', 'no publisher now'], idle: ['◌', 'published, and not logged'] };
 const MOST_ROWS = 100;
@@ -42,6 +42,54 @@ function TopicAge({ row, figures, now }) {
   return (goesOn ? Math.min(row.age_s, 1 / row.rate_hz) : row.age_s + since).toFixed(1);
 }
 
+// Topics that the node does not take are sampled by the page in turn while rows of the table are in view: those rows first.
+const AT_ONCE = 3;
+const AGAIN_MS = 20e3;
+const OUT_OF_VIEW_MS = 80e3;
+function useSamples(rows, figures, box) {
+  const [inView, setInView] = useState(new Set());
+  useEffect(() => {
+    const looking = new IntersectionObserver((entries) => setInView((before) => {
+      const now = new Set(before);
+      for (const { target, isIntersecting } of entries) now[isIntersecting ? 'add' : 'delete'](target.dataset.row);
+      return now;
+    }));
+    for (const row of box.current?.querySelectorAll('[data-row]') ?? []) looking.observe(row);
+    return () => looking.disconnect();
+  }, [rows.map(({ topic }) => topic).join()]);
+  useItems('sample', (head) => {
+    const { at, of, age_s: age, ...more } = head;
+    measured.value = { ...measured.value, [of]: { ...more, at: age === null ? null : at - age * 1e3, sampled: at } };
+  });
+  const due = rows.filter((row) => row.publishers > 0 && !isCounted(row, figures) && row.topic !== inspected.value)
+    .map(({ topic }) => [topic, (measured.value[topic]?.sampled ?? 0) + (inView.has(topic) ? AGAIN_MS : OUT_OF_VIEW_MS)])
+    .filter(([, at]) => at <= figures.at).sort((a, b) => a[1] - b[1]).slice(0, AT_ONCE).map(([topic]) => `${topic}#?`);
+  useWatch([], () => (inView.size ? due : []));
+}
+
+// Whether the node takes its messages now.
+const isCounted = (row, figures) => figures.state === 'running' && row.isLogged && row.enabled !== false && typeof row.rate_hz === 'number';
+
+// How a sample was taken, in words; empty for what is counted, or read now.
+function sampling(own, figures) {
+  if (!own?.sampled || own.why) return '';
+  const ago = span(Math.max(0, figures.at - own.sampled) / 1e3);
+  return ` (a sample of ${own.seconds} s, ${ago} ago: ${own.messages} ${own.messages === 1 ? 'message' : 'messages'}${own.latched ? '; its publisher keeps the last one for late subscribers' : ''})`;
+}
+
+function sampledRate(own) {
+  if (own?.hz) return own.hz.toFixed(1);
+  if (!own?.sampled || own.why) return '–';
+  return own.latched && own.bytes !== null ? 'latched' : '< 0.5';
+}
+
+// At the end of its sample; what sent nothing in it ages on.
+function OwnAge({ own, now }) {
+  if (own?.at === null || own?.at === undefined) return '–';
+  const until = own.sampled && own.messages ? own.sampled : now.value ?? own.at;
+  return (Math.max(0, until - own.at) / 1e3).toFixed(1);
+}
+
 // Every topic: those of the node's report, and those that are published now. Publishers are counted by this page where it reads ROS.
 function allTopics(figures) {
   const told = new Map(topics.value.map(([topic, kind, type, publishers]) => [topic, { kind, type, publishers }]));
@@ -56,33 +104,38 @@ function allTopics(figures) {
 export function TopicTable({ figures, now }) {
   const [wanted, setWanted] = useState('');
   const [isAll, setIsAll] = useState(false);
+  const box = useRef(null);
   const rows = allTopics(figures);
-  if (!rows.length) return html`<div class="panel"><p class="empty">No topic has a message yet.</p></div>`;
   const words = wanted.toLowerCase().split(/\s+/).filter(Boolean);
   const found = rows.filter(({ topic, type }) => words.every((word) => `${topic} ${type}`.toLowerCase().includes(word)));
   const shown = isAll ? found : found.slice(0, MOST_ROWS);
   const untold = total.value - topics.value.length;
+  useSamples(shown, figures, box);
+  if (!rows.length) return html`<div class="panel"><p class="empty">No topic has a message yet.</p></div>`;
   const cell = (row, name) => {
-    const own = measured.value[row.topic];
-    if (name === 'rate') return (row.rate_hz || own?.hz)?.toFixed(1) ?? '–';
+    const own = isCounted(row, figures) ? null : measured.value[row.topic];
+    if (name === 'rate') return own ? sampledRate(own) : row.rate_hz?.toFixed(1) ?? '–';
     if (name === 'size') return volume(own?.bytes ?? row.size);
-    if (name === 'age' && !row.isLogged) return own && now.value !== null ? (Math.max(0, now.value - own.at) / 1e3).toFixed(1) : '–';
+    if (name === 'age' && own) return html`<${OwnAge} own=${own} now=${now} />`;
     if (name === 'age') return html`<${TopicAge} row=${row} figures=${figures} now=${now} />`;
     if (name === 'missed' && row.missed === null && row.missed_estimated !== null) return html`~${digits(row.missed_estimated)}`;
     return digits(row[name]);
   };
   return html`<div class="panel topics-panel"><div class="panel-head"><h3>Topics</h3>${rows.length > SEARCHED && html`<input type="search" aria-label="Search topics and types" placeholder=${`search ${rows.length} topics`} value=${wanted} onInput=${(event) => setWanted(event.target.value)} />`}
       <span class=${`verdict ${figures.balanced ? 'good' : 'bad'}`} title="Whether, for each topic, received = stored + skipped + rejected + dropped + open">${figures.balanced === null ? '' : figures.balanced ? 'the ledger balances' : 'the ledger does not balance'}</span></div>
-    <div class="scroll"><table class="topics">
+    <div class="scroll"><table class="topics" ref=${box}>
       <thead><tr><th><span class="visually-hidden">State</span></th><th title="A click shows the newest message">Topic</th>${COLUMNS.map(([, label, what]) => html`<th class="n" title=${what}>${label}</th>`)}</tr></thead>
       <tbody>${shown.map((row) => {
         const [kind, why] = state(row);
         const isOpen = inspected.value === row.topic;
-        return [html`<tr key=${row.topic} class=${row.publishers === 0 ? 'silent' : ''}><td><${Mark} kind=${kind} why=${why} /></td>
+        const own = isCounted(row, figures) ? null : measured.value[row.topic];
+        const sample = sampling(own, figures);
+        return [html`<tr key=${row.topic} data-row=${row.topic} class=${row.publishers === 0 ? 'silent' : ''}><td><${Mark} kind=${kind} why=${why} /></td>
           <td><button type="button" class="topic" aria-expanded=${isOpen} data-inspect=${row.topic} title="Show the newest message" onClick=${() => { inspected.value = isOpen ? null : row.topic; }}><b>${row.topic}</b></button>
-            <small>${row.publishers === 0 ? 'no publisher' : row.isLogged ? row.sensor || '–' : 'not logged'}${row.type && html` · <span title=${row.type}>${row.type.split('/').at(-1)}</span>`}</small>
+            <small>${row.publishers === 0 ? 'no publisher' : row.isLogged ? row.sensor || '–' : 'not logged'}${row.type && html` · <span title=${row.type}>${row.type.split('/').at(-1)}</span>`}${sample && html` · <span class="n">sampled ${span(Math.max(0, figures.at - own.sampled) / 1e3)} ago</span>`}</small>
+            ${(own?.why || row.unavailable) && html`<small data-topic=${row.topic} data-field="why" title="Why its messages cannot be received here">${String(own?.why || row.unavailable)}</small>`}
             ${row.stamps && html`<small class="stamps" data-topic=${row.topic} data-field="stamps" title="How the stamps of its messages differ from the times at which they arrived">${row.stamps}</small>`}</td>
-          ${COLUMNS.map(([name, , what]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) && unseen(row.topic) !== 0 ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name} title=${what}>${cell(row, name)}</td>`)}</tr>`,
+          ${COLUMNS.map(([name, , what]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) && unseen(row.topic) !== 0 ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name} title=${['rate', 'size', 'age'].includes(name) ? what + sample : what}>${cell(row, name)}</td>`)}</tr>`,
         isOpen && html`<tr key=${`${row.topic}#`} class="inspected"><td></td><td colspan=${COLUMNS.length + 1}><${Message} key=${row.topic} topic=${row.topic} /></td></tr>`];
       })}</tbody></table></div>
     ${found.length > shown.length && html`<button type="button" onClick=${() => setIsAll(true)}>Show all ${found.length}</button>`}

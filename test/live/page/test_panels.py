@@ -6,8 +6,8 @@ import json
 import math
 import secrets
 import time
-from collections.abc import Iterator
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from domains import free_domain
 from e2e.processes import Process, Processes, until
 from lake.making import folder_store
 from live.browsing import CHROMIUM, Served, fits, holds, opened, press
-from live.page.any_robot import HOSTILE, LATITUDE, LONGITUDE
+from live.page.any_robot import DESCRIPTION, HOSTILE, LATITUDE, LONGITUDE
 from live.test_history import patrol
 from live.test_kinds import cdr
 from live.test_panels import TYPES, transforms
@@ -79,6 +79,28 @@ def inspect(page: Page, topic: str) -> None:
     """Show its newest message, or stop; it is found by its name."""
     page.get_by_label('Search topics and types').fill(topic)
     press(page.locator(f'[data-inspect="{topic}"]'))
+
+
+@contextmanager
+def observer(watching: Watching) -> Iterator[Callable[[], set[str]]]:
+    """Yields a function that returns the topics to which the page subscribes, once it has subscribed to any."""
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=int(watching.processes.environ['ROS_DOMAIN_ID']))
+    node = rclpy.create_node('observer', context=context, start_parameter_services=False, enable_rosout=False)
+
+    def read() -> set[str]:
+        with suppress(RuntimeError):  # the page is not visible yet
+            return {topic for topic, _ in node.get_subscriber_names_and_types_by_node('shadowhound_live', '/')}
+        return set()
+
+    try:
+        until(lambda: '/scan' in read(), 'the page is seen')
+        yield read
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
 
 
 def test_each_standard_type_has_its_panel(page: Page) -> None:
@@ -195,25 +217,56 @@ def test_the_page_fits_on_a_phone(page: Page) -> None:
 
 def test_the_cost_of_many_topics_is_bounded(page: Page, watching: Watching) -> None:
     """The page subscribes to the visible topics, and not to the other 500."""
-    import rclpy
-
-    context = rclpy.Context()
-    rclpy.init(args=[], context=context, domain_id=int(watching.processes.environ['ROS_DOMAIN_ID']))
-    node = rclpy.create_node('observer', context=context, start_parameter_services=False, enable_rosout=False)
-
-    def read() -> set[str]:
-        with suppress(RuntimeError):  # the page is not visible yet
-            return {topic for topic, _ in node.get_subscriber_names_and_types_by_node('shadowhound_live', '/')}
-        return set()
-
-    try:
-        until(lambda: '/scan' in read(), 'the page is seen')
+    with observer(watching) as read:
         found = read()
         assert not any(topic.startswith('/a/') for topic in found)
         assert len(found) < 20, found
-    finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
+
+
+def test_topics_that_are_not_logged_have_figures(page: Page, watching: Watching) -> None:
+    """Rate, size and age, and when they were sampled, without a click, while the table is in view.
+
+    At most two of the 510 topics that nobody else takes are subscribed to at a time, and none once the table is out of view.
+    """
+    with observer(watching) as read:
+
+        def sampled() -> set[str]:
+            return {topic for topic in read() if topic.startswith('/a/')}
+
+        def cells(topic: str) -> list[str]:
+            return [text(page, f'[data-topic="{topic}"][data-field={name}]') for name in ('rate', 'size', 'age')]
+
+        def search(words: str, *topics: str) -> None:
+            page.get_by_label('Search topics and types').fill(words)
+            page.evaluate('document.querySelector("table.topics").scrollIntoView({block: "center", behavior: "instant"})')
+            began_s = time.monotonic()
+            for topic in topics:
+                until(lambda topic=topic: 'sampled' in text(page, f'tr[data-row="{topic}"]'), f'{topic} is sampled')  # type: ignore[misc]
+            assert time.monotonic() - began_s < 30
+
+        search('/wheel', '/wheel/speed', '/wheel/name')
+        rate, size, age = cells('/wheel/speed')
+        assert 15 < float(rate) < 25
+        assert size == '8 B'
+        assert 0 <= float(age) < 1
+        assert 1.5 < float(cells('/wheel/name')[0]) < 2.5
+        assert 'a sample of 2' in page.locator('[data-topic="/wheel/speed"][data-field=rate]').get_attribute('title')  # type: ignore[operator]
+        search('/robot_description', '/robot_description')
+        rate, size, age = cells('/robot_description')
+        assert (rate, size) == ('latched', f'{len(DESCRIPTION) + 9} B')
+        assert float(age) > 1
+        search('/a/n50', '/a/n50', '/a/n500')
+        assert cells('/a/n500') == ['< 0.5', '–', '–']
+        search('/a/')
+        most = 0
+        end_s = time.monotonic() + 6
+        while time.monotonic() < end_s:
+            most = max(most, len(sampled()))
+        assert 0 < most <= 2
+        page.evaluate('scrollTo({top: 0, behavior: "instant"})')
+        until(lambda: not sampled(), 'the table is out of view')
+        page.get_by_label('Search topics and types').fill('')
+        assert page.evaluate('shadowhound.wrong') == 0
 
 
 def test_transforms_place_robot_and_sensors(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,146 @@
+"""Topics of the table that are not read otherwise, sampled in turn: rate, mean size and age. Importing this loads rclpy.
+
+There are at most two subscriptions at a time, each for about two seconds: shorter for many or large messages, longer for few.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from rclpy.node import Node
+
+from shadowhound_data_logger.core.untrusted import visible
+from shadowhound_data_logger.live.kinds import LiveItem
+from shadowhound_data_logger.ros.endpoints import LARGE_TYPES, Plan
+from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
+
+AT_ONCE: Final = 2
+START_S: Final = 0.5
+"""Minimum interval between the starts of two samples."""
+AGAIN_S: Final = 5.0
+"""Minimum interval between two samples of a topic."""
+SAMPLE_S: Final = 2.0
+SLOW_S: Final = 4.5
+"""Duration while fewer than ``FEW`` messages have arrived, but at least one."""
+FEW: Final = 3
+ENOUGH, ENOUGH_S = 100, 0.5
+"""A sample with this many messages ends after this time."""
+ENOUGH_BYTES, ENOUGH_LARGE = 4 << 20, 5
+"""A sample with this many bytes ends with this many messages."""
+DEPTH, LARGE_DEPTH = 128, 8
+BURST_S: Final = 0.1
+"""How late the last message of a steady stream may be seen."""
+MAX_KNOWN: Final = 4000
+"""Maximum topics whose newest message is remembered."""
+
+
+class _Sample:
+    """One subscription to a topic, for a short time."""
+
+    def __init__(self, node: Node, topic: str, type_name: str, *, is_first: bool) -> None:
+        """The first sample also receives what latched publishers keep. Raises TypeUnavailable or SubscriptionRefused."""
+        offered = endpoints(node, topic)
+        self.is_latched = bool(offered) and all(each.reliable and each.transient_local for each in offered)
+        keeps = self.is_latched and is_first
+        depth = LARGE_DEPTH if type_name in LARGE_TYPES else DEPTH
+        self._began_s, self._began_ns = time.monotonic(), time.time_ns()
+        self._reader = Reader(node, Plan(topic, type_name, reliable=keeps, transient_local=keeps, depth=depth), PolledGroup())
+        self._arrivals: list[int] = []
+        self._sizes: list[int] = []
+        self._newest_ns = 0
+
+    def drain(self) -> None:
+        for one in self._reader.drain():
+            self._sizes.append(len(one.cdr))
+            is_kept = self.is_latched and one.source_ns < self._began_ns  # it says nothing about the rate
+            if not is_kept:
+                self._arrivals.append(one.received_ns)
+            self._newest_ns = max(self._newest_ns, one.source_ns if is_kept else one.received_ns)
+
+    def is_complete(self, now_s: float) -> bool:
+        took_s, count = now_s - self._began_s, len(self._arrivals)
+        return (
+            took_s >= (SLOW_S if 0 < count < FEW else SAMPLE_S)
+            or (took_s >= ENOUGH_S and count >= ENOUGH)
+            or (count >= ENOUGH_LARGE and sum(self._sizes) >= ENOUGH_BYTES)
+        )
+
+    @property
+    def hz(self) -> float | None:
+        """The rate; None with fewer than two messages."""
+        count = len(self._arrivals)
+        if count < 2:
+            return None
+        first, last, now_ns = self._arrivals[0], self._arrivals[-1], time.time_ns()
+        span_s = (last - first) / 1e9
+        if (now_ns - last) / 1e9 > BURST_S + 3 * span_s / (count - 1):
+            span_s = (now_ns - first) / 1e9
+        return round((count - 1) / max(span_s, 1e-3), 2)
+
+    def told(self, now_s: float) -> dict[str, Any]:
+        return {'seconds': round(now_s - self._began_s, 1), 'messages': len(self._arrivals), 'hz': self.hz,
+                'latched': self.is_latched}  # fmt: skip
+
+    def newest(self, now_s: float) -> tuple[int, float] | None:
+        """Mean size, and when the newest message arrived (monotonic) or was sent, if it was kept; None without messages."""
+        if not self._sizes:
+            return None
+        return round(sum(self._sizes) / len(self._sizes)), now_s - max(0.0, (time.time_ns() - self._newest_ns) / 1e9)
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+class Sampler:
+    """Samples the topics that viewers need, on the thread ``topics``. New; ``follow`` and ``step`` repeatedly; close once."""
+
+    def __init__(self, node: Node, on_items: Callable[[list[LiveItem]], None]) -> None:
+        self._node, self._on_items = node, on_items
+        self._wanted: Mapping[str, str] = {}
+        self._samples: dict[str, _Sample] = {}
+        self._ended_s: dict[str, float] = {}
+        self._newest: dict[str, tuple[int, float]] = {}
+        self._start_s = 0.0
+
+    def follow(self, wanted: Mapping[str, str]) -> None:
+        """The topics to sample, with their types. Ends all other samples."""
+        self._wanted = wanted
+        for topic in self._samples.keys() - wanted.keys():
+            self._samples.pop(topic).close()
+
+    def step(self, now_s: float) -> None:
+        """Read the current samples, and start the next one: of the topic whose last sample is the oldest."""
+        for topic, sample in list(self._samples.items()):
+            sample.drain()
+            if sample.is_complete(now_s):
+                self._samples.pop(topic).close()
+                self._end(topic, now_s, sample.told(now_s), sample.newest(now_s))
+        if not self._wanted or len(self._samples) >= AT_ONCE or now_s < self._start_s:
+            return
+        ended_s = {topic: self._ended_s.get(topic, -math.inf) for topic in self._wanted if topic not in self._samples}
+        topic = min(ended_s, key=ended_s.__getitem__, default='')
+        if topic and now_s - ended_s[topic] >= AGAIN_S:
+            self._start_s = now_s + START_S
+            try:
+                is_first = topic not in self._newest
+                self._samples[topic] = _Sample(self._node, topic, self._wanted[topic], is_first=is_first)
+            except (TypeUnavailable, SubscriptionRefused) as error:
+                self._end(topic, now_s, {'why': visible(str(error))[:300]}, None)
+
+    def _end(self, topic: str, now_s: float, told: Mapping[str, Any], newest: tuple[int, float] | None) -> None:
+        for known in (self._ended_s, self._newest):
+            if len(known) >= MAX_KNOWN:
+                known.clear()
+        self._ended_s[topic] = now_s
+        if newest is not None:
+            self._newest[topic] = newest
+        size, newest_s = self._newest.get(topic, (None, None))
+        head = {'at': round(now_s * 1e3, 1), 'of': topic, 'bytes': size,
+                'age_s': None if newest_s is None else round(now_s - newest_s, 3), **told}  # fmt: skip
+        self._on_items([LiveItem('', 'sample', head=head)])
+
+    def close(self) -> None:
+        self.follow({})
