@@ -34,8 +34,10 @@ from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.types import PLACEHOLDER, MessageTypes
 from shadowhound_data_logger.ros.reader import installed_class, rclpy_version
 
-RCLPY: Final[Mapping[int, bool]] = {3: False, 7: True, 9: True}
-"""Major versions of rclpy whose structures are known (Humble, Jazzy, Kilted): whether types have hashes and keys."""
+TESTED: Final = {((7,), 'rmw_fastrtps_cpp'), ((7,), 'rmw_cyclonedds_cpp'), ((9,), 'rmw_fastrtps_cpp')}
+"""Major versions of rclpy (7: Jazzy, 9: Kilted) and RMWs."""
+FIRST_WITH_HASH: Final = 7
+"""Types have hashes and keys since this major version of rclpy."""
 RMWS: Final[Mapping[str, tuple[bytes, ...]]] = {
     'rmw_fastrtps_cpp': (b'rosidl_typesupport_introspection_c', b'rosidl_typesupport_fastrtps_c'),
     'rmw_cyclonedds_cpp': (b'rosidl_typesupport_introspection_c',),
@@ -134,24 +136,33 @@ class Description(Structure):
     _fields_ = [('type', IndividualDescription), ('referenced', Sequence)]
 
 
-def _introspection(*, keyed: bool) -> tuple[Any, Any]:
+class Layout(NamedTuple):
+    """What is different in each distribution."""
+
+    member: Any
+    members: Any
+    has_hash: bool
+
+
+def _layout(*, has_hash: bool) -> Layout:
     """``rosidl_typesupport_introspection_c__MessageMember`` and ``__MessageMembers``."""
 
     class Member(Structure):
         _fields_ = [
             ('name', c_char_p), ('type_id', c_uint8), ('string_upper_bound', c_size_t), ('members', c_void_p),
-            *([('is_key', c_bool)] if keyed else []), ('is_array', c_bool), ('array_size', c_size_t), ('is_upper_bound', c_bool),
-            ('offset', c_uint32), ('default_value', c_void_p),
+            *([('is_key', c_bool)] if has_hash else []), ('is_array', c_bool), ('array_size', c_size_t),
+            ('is_upper_bound', c_bool), ('offset', c_uint32), ('default_value', c_void_p),
             *((f'{of}_function', c_void_p) for of in ('size', 'get_const', 'get', 'fetch', 'assign', 'resize')),
         ]  # fmt: skip
 
     class Members(Structure):
         _fields_ = [
             ('namespace', c_char_p), ('name', c_char_p), ('count', c_uint32), ('size_of', c_size_t),
-            *([('has_any_key', c_bool)] if keyed else []), ('members', POINTER(Member)), ('init', c_void_p), ('fini', c_void_p),
+            *([('has_any_key', c_bool)] if has_hash else []), ('members', POINTER(Member)),
+            ('init', c_void_p), ('fini', c_void_p),
         ]  # fmt: skip
 
-    return Member, Members
+    return Layout(Member, Members, has_hash)
 
 
 _GetHandle = ctypes.CFUNCTYPE(c_void_p, c_void_p, c_char_p)
@@ -170,14 +181,6 @@ _FAIL: Final = _Fail(int)
 
 class Unsupported(LookupError):
     """No type support can be made for a type here; the text is the reason."""
-
-
-class Layout(NamedTuple):
-    """What is different in each distribution."""
-
-    member: Any
-    members: Any
-    has_hash: bool
 
 
 class Message(NamedTuple):
@@ -276,8 +279,6 @@ class Maker:
         encoding, text, _ = describe(type_name)
         if '@key' in text:
             raise Unsupported(f'{type_name} has a key')
-        if len({name for name, _ in fields}) < len(fields):
-            raise Unsupported(f'{type_name} has two fields with the same name')
         members = (self._layout.member * len(fields))()
         count = offset = 0
         align, described, nested = 1, [], set[str]()
@@ -354,11 +355,10 @@ def _maker() -> tuple[Maker | None, str]:
     if os.environ.get('SHADOWHOUND_TYPE_SUPPORT', 'on').lower() in {'off', '0', 'false', 'no'}:
         return None, 'SHADOWHOUND_TYPE_SUPPORT is off'
     rmw, version = get_rmw_implementation_identifier(), rclpy_version()
-    is_keyed = RCLPY.get(version[0] if version else 0)
-    if rmw not in RMWS or is_keyed is None or ctypes.sizeof(c_void_p) != POINTER_BYTES or sys.byteorder != 'little':
+    if (version[:1], rmw) not in TESTED or ctypes.sizeof(c_void_p) != POINTER_BYTES or sys.byteorder != 'little':
         return None, f'not tested with {rmw} and rclpy {".".join(map(str, version))}'
     try:
-        return _verified(Layout(*_introspection(keyed=is_keyed), is_keyed), RMWS[rmw]), ''
+        return _verified(_layout(has_hash=version[0] >= FIRST_WITH_HASH), RMWS[rmw]), ''
     except (LookupError, AttributeError) as error:
         return None, f'the structures of this ROS are not as expected: {error}'
 

@@ -10,6 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import rclpy
@@ -21,7 +22,11 @@ from shadowhound_data_logger.ros.reader import PolledGroup, SubscriptionEventCal
 from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
 
 KINDS = 'Arrays', 'BasicTypes', 'BoundedSequences', 'Empty', 'MultiNested', 'Nested', 'Strings', 'UnboundedSequences', 'WStrings'
-TYPES = [f'test_msgs/msg/{kind}' for kind in KINDS]
+TYPES = [
+    'diagnostic_msgs/msg/DiagnosticArray', 'nav_msgs/msg/Odometry', 'rcl_interfaces/msg/ParameterEvent',
+    'sensor_msgs/msg/PointCloud2',
+    *(f'test_msgs/msg/{kind}' for kind in KINDS if find_spec('test_msgs')),
+]  # fmt: skip
 QOS = QoSProfile(depth=1000)
 PATIENCE_S = 60.0
 
@@ -32,12 +37,15 @@ def topic_of(type_name: str) -> str:
 
 def messages(type_name: str) -> list[bytes]:
     """Of the default values, and of those that rosidl tests with."""
+    default = installed_class(type_name)()
+    if not type_name.startswith('test_msgs'):
+        return [bytes(serialize_message(default))] * 2
     from test_msgs import message_fixtures
 
     kind = type_name.rpartition('/')[2]
     name = ''.join(f'_{letter.lower()}' if letter.isupper() else letter for letter in kind)
     fixtures = getattr(message_fixtures, f'get_msg{name}'.replace('_w_strings', '_wstrings'))()
-    return [bytes(serialize_message(each)) for each in (*fixtures, installed_class(type_name)())]
+    return [bytes(serialize_message(each)) for each in (*fixtures, default)]
 
 
 def until(is_done: Callable[[], object], what: str) -> None:
