@@ -218,9 +218,9 @@ def is_installed(type_name: str) -> bool:
 
 
 def other_definition(node: Node, topic: str, type_name: str) -> str:
-    """Whose definition of a type is not the one that its class was made from, as a sentence; empty if nobody's is known to be.
+    """Which publisher has another definition of a type than the one its class was made from, as a sentence; empty if none has.
 
-    Publishers announce the hash of the definition since Iron, those without ROS do not.
+    ROS nodes announce the hash of their definition since Iron; programs without ROS do not.
     """
     made = getattr(message_class(type_name), 'HASH', '')
     for info in node.get_publishers_info_by_topic(topic) if made else ():
