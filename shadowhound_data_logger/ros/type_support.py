@@ -389,7 +389,7 @@ def _generated(type_name: str, identifier: bytes) -> TypeSupport:
 
 
 def _equal_members(layout: Layout, ours: int, theirs: int) -> bool:
-    """Numbers are compared before a pointer next to them is followed: in an unknown structure it is none."""
+    """Compare numbers before following a pointer next to them: in an unknown structure it may be something else."""
     made, real = layout.members.from_address(ours), layout.members.from_address(theirs)
     if (made.count, made.size_of, bool(real.members)) != (real.count, real.size_of, True) or (made.namespace, made.name) != (
         real.namespace,
