@@ -40,8 +40,8 @@ CYCLONE: Final = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
 LEAVE_OUT: Final = """
 from shadowhound_data_logger.core import model
 class Taken(model.Taken):
-    def __new__(cls, cdr, source_ns, publisher, number, received_ns):
-        return super().__new__(cls, cdr, source_ns, None, None, received_ns)
+    def __new__(cls, cdr, source_ns, publisher, number, *times):
+        return super().__new__(cls, cdr, source_ns, None, None, *times)
 model.Taken = Taken
 """
 """A node without message numbers; rclpy is not imported before the node has chosen a middleware."""

@@ -15,7 +15,7 @@ from e2e.reading import STRING, texts
 LEAVE_OUT = """
 from shadowhound_data_logger.core import model
 Taken = model.Taken
-model.Taken = lambda cdr, source_ns, publisher, number, received_ns: Taken(cdr, source_ns, None, None, received_ns)
+model.Taken = lambda cdr, source_ns, publisher, number, *times: Taken(cdr, source_ns, None, None, *times)
 """
 """Set before the reader is imported: on Humble that loads the RMW, which is not chosen yet."""
 UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}

@@ -7,6 +7,7 @@ were sent, by a driver on the same machine, and received.
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 from shadowhound_data_logger.core import model
 from shadowhound_data_logger.core.clock import SystemClock
@@ -22,9 +23,10 @@ def behind_ns() -> int:
         return 0
 
 
-def taken_behind(cdr: bytes, source_ns: int, publisher: str | None, number: int | None, received_ns: int) -> Taken:
-    shift_ns = behind_ns()
-    return Taken(cdr, source_ns - shift_ns, publisher, number, received_ns - shift_ns)
+def taken_behind(cdr: bytes, source_ns: int, publisher: str | None, number: int | None, received_ns: int, *dated: Any) -> Taken:
+    """The reader's message, or the same one with its date, whose times are shifted already."""
+    shift_ns = 0 if dated else behind_ns()
+    return Taken(cdr, source_ns - shift_ns, publisher, number, received_ns - shift_ns, *dated)
 
 
 SystemClock.wall_ns = lambda _: time.time_ns() - behind_ns()  # type: ignore[method-assign]
