@@ -68,7 +68,6 @@ DISK_MB: Final = 96
 RETRIED: Final = 0.5
 """Share of the damaged files that are repaired and retried."""
 FLAGS: Final = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox')
-IS_TODAY: Final = "document.querySelector('svg[role=slider]')?.getAttribute('aria-valuemin') % 86400000 === 0"
 KINDS: Final = ('stopped', 'killed', 'paused', 'starved', 'filled', 'damaged')
 RESTARTED_S: Final = 10.0
 """A kill's loss ends with the first message of the next start."""
@@ -266,9 +265,12 @@ def on_page(processes: Processes, node: Node) -> list[Gap] | None:
     with sync_playwright() as playwright, closing(playwright.chromium.launch(executable_path=chromium, args=FLAGS)) as browser:
         page = browser.new_page()
         page.goto(url)
-        page.get_by_role('button', name='Today', exact=True).dispatch_event('click')
-        until(lambda: page.evaluate(IS_TODAY), 'the page shows today')
-        report = page.locator('rect.gap').evaluate_all('gaps => gaps.map(gap => ({...gap.dataset}))')
+        gaps = page.locator('rect.gap')
+        with page.expect_response(lambda answer: answer.url.endswith('/api/gaps')) as today:  # without a time: the whole day
+            page.get_by_role('button', name='Today', exact=True).dispatch_event('click')
+        count = len(today.value.json()['gaps'])
+        until(lambda: gaps.count() == count, lambda: f'the page shows the {count} gaps of today: {gaps.count()}')
+        report = gaps.evaluate_all('gaps => gaps.map(gap => ({...gap.dataset}))')
     return [
         Gap(OBJECTS, gap['topic'], None, None, gap['kind'], gap['cause'], round(float(gap['from']) * 1e6),
             round(float(gap['to']) * 1e6), None, None, int(gap['count']), 1, '', None)
