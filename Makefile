@@ -1,4 +1,4 @@
-# Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
+# Targets that need the environment install it first (scripts/setup); if it is up to date, that takes milliseconds.
 
 .DEFAULT_GOAL := help
 .PHONY: help setup test test-long test-matrix torture check format demo bench docs lock vendor sbom audit tower tower-secrets unitree clean
@@ -6,26 +6,28 @@
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 TOWER_ARGS ?=
+# Installs what the demo and a server need, or all packages where these are installed.
+SMALL_SETUP = @PYTHON="$(PYTHON)" scripts/setup demo
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
 
-setup: ## make the environment (.venv, go2_interfaces); PYTHON=... names the interpreter
+setup: ## install the environment of tests and checks (.venv, go2_interfaces); PYTHON=... names the interpreter
 	@PYTHON="$(PYTHON)" scripts/setup
 
-unitree: setup ## build unitree_go, the messages of a Unitree robot's own topics, into the environment: some minutes, once
+unitree: setup ## build unitree_go, the messages of a Unitree robot's own topics, into the environment; a few minutes, once
 	scripts/unitree
 
-test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
+test: setup ## run all tests but the long ones; PYTEST_ARGS="-k spool -x" is passed to pytest
 	PYTHONDONTWRITEBYTECODE= scripts/with-env pytest -n auto --no-loadscope-reorder $(PYTEST_ARGS)
 
-test-long: setup ## run the tests that take minutes: kills, full disks, the demo, Towers
+test-long: setup ## run the tests that take minutes: kills, full disks, the demo, servers
 	PYTHONDONTWRITEBYTECODE= SHADOWHOUND_TEST_LONG=1 scripts/with-env pytest -n auto --no-loadscope-reorder -m long $(PYTEST_ARGS)
 
-test-matrix: ## run all tests on other Pythons, numpys and ROS distributions; CELLS=... names some
+test-matrix: ## run all tests on other Pythons, numpys and ROS distributions; CELLS=... selects some
 	@PYTEST_ARGS="$(PYTEST_ARGS)" scripts/test-matrix $(CELLS)
 
-torture: setup ## campaigns of faults, kills, full disks, rot, hostile input and long outages; TORTURE_ARGS=--short is shorter
+torture: setup ## campaigns of faults, kills, full disks, damaged files, hostile input and long outages; TORTURE_ARGS=--short is shorter
 	scripts/with-env python -m torture $(TORTURE_ARGS)
 
 check: setup ## lint, format and types
@@ -33,35 +35,38 @@ check: setup ## lint, format and types
 	scripts/with-env ruff format --check .
 	scripts/with-env mypy
 
-format: setup ## let ruff repair and format what it can
+format: setup ## fix and format what ruff can
 	scripts/with-env ruff check --fix .
 	scripts/with-env ruff format .
 
-demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, a minute and a half; DEMO_ARGS=--keep keeps its live page
+demo: ## a simulated Go2, a server and one patrol mission, 90 seconds; DEMO_ARGS=--keep keeps the live page running
+	$(SMALL_SETUP)
 	scripts/with-env python -m shadowhound_sim.demo $(DEMO_ARGS)
 
 bench: setup ## benchmarks against the baseline, as ratios, into docs/evidence/benchmarks.md; BENCH_ARGS=--quick is shorter
 	scripts/with-env python bench/run.py $(BENCH_ARGS)
 
-docs: setup ## write docs/parameters.md and docs/commands.md from the code, and build the documentation site into build/site
+docs: ## write docs/parameters.md and docs/commands.md from the code, and build the documentation site into build/site
+	$(SMALL_SETUP)
 	scripts/docs
 
-lock: setup ## write requirements/*.txt anew from requirements/*.in; LOCK_ARGS=--upgrade renews the pins
+lock: setup ## update requirements/*.txt from requirements/*.in; LOCK_ARGS=--upgrade also updates the pins
 	scripts/lock $(LOCK_ARGS)
 
-vendor: ## bundle what the live page needs of others (three, uPlot, preact) from npm
+vendor: ## bundle the libraries of the live page (three, uPlot, preact) from npm
 	scripts/vendor
 
-sbom: setup ## bills of materials (CycloneDX) of the lock files and of what is vendored, into build/sbom
+sbom: setup ## bills of materials (CycloneDX) of the lock files and of the bundled libraries, into build/sbom
 	scripts/with-env python requirements/supply_chain.py sbom
 
-audit: setup ## known vulnerabilities of what the lock files pin; skipped where their database cannot be reached
+audit: setup ## known vulnerabilities of the pinned packages; skipped if their database cannot be reached
 	scripts/with-env python requirements/supply_chain.py audit
 
-tower-secrets: ## credentials of a Tower, once; TOWER_ARGS="--host 192.168.1.10 --robot thor" is handed on
+tower-secrets: ## credentials of a server, once; TOWER_ARGS="--host 192.168.1.10 --robot rover" is passed to tower/make_secrets.py
 	python3 tower/make_secrets.py $(TOWER_ARGS)
 
-tower: setup ## a Tower without Docker (SeaweedFS, PostgreSQL or SQLite, MLflow), until it is interrupted
+tower: ## a server without Docker (SeaweedFS, PostgreSQL or SQLite, MLflow), until it is interrupted
+	$(SMALL_SETUP)
 	scripts/with-env python tower/run.py $(TOWER_ARGS)
 
 clean: ## remove the environment and everything that was built

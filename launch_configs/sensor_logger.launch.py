@@ -1,4 +1,4 @@
-"""Launches the data logger, one node per robot, and starts a node again when it crashes.
+"""Launches the data logger, one node per robot, and restarts a node that crashes.
 
 ros2 launch shadowhound_data_logger sensor_logger.launch.py namespace:=tachi params_file:=/path/to/my.yaml live:=true
 ros2 launch shadowhound_data_logger sensor_logger.launch.py robots:=robot0,robot1
@@ -31,17 +31,17 @@ from launch_ros.substitutions import ExecutableInPackage
 
 FOLDER = Path(__file__).resolve().parent
 SPOOL = Path(os.environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser() / 'spool'
-"""Named, since before the first start of the node there is none yet, and the page would be that of the store."""
+"""Passed to the page, which would otherwise be that of the store until the node has run for the first time."""
 RESTART_AFTER_S = 2.0
 FINAL = (0, 2)
-"""Exit codes that mean what they say: asked to stop, and settings that were refused. Starting again would change neither."""
+"""Exit codes after which the node is not restarted: stopped on request, and invalid settings."""
 PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
-"""Fast DDS 3 reads the first and warns of the second, Fast DDS 2 knows the second only."""
+"""Fast DDS 3 reads the first and warns about the second, Fast DDS 2 reads the second only."""
 FAST_DDS_2 = ('humble', 'iron', 'jazzy')
 
 
 def profile() -> list[Action]:
-    """Name the Fast DDS profile that lets raw images through, unless there is one already."""
+    """Set the Fast DDS profile with which raw images arrive, unless one is set."""
     if any(os.environ.get(name) for name in PROFILE_VARIABLES):
         return []
     variable = PROFILE_VARIABLES[os.environ.get('ROS_DISTRO') in FAST_DDS_2]
@@ -57,8 +57,8 @@ def loggers(context: LaunchContext) -> list[Action]:
 
 
 def logger(namespace: str, parameters: list[str]) -> list[Action]:
-    """The node of a namespace, and what to do when it ends."""
-    node = Node(  # without a name: the node has one, and launch would warn of a second one at each restart
+    """The node of a namespace, and what to do when it exits."""
+    node = Node(  # without a name, because the node has one, and launch would warn about a second one at each restart
         package='shadowhound_data_logger',
         executable='sensor_logger_node',
         namespace=namespace,
@@ -70,14 +70,14 @@ def logger(namespace: str, parameters: list[str]) -> list[Action]:
     def ended(event: ProcessExited, context: LaunchContext) -> list[Any]:
         if event.returncode in FINAL or context.is_shutdown:
             return []
-        again = LogInfo(msg=f'sensor_logger_node ended with {event.returncode}: it starts again in {RESTART_AFTER_S:g} s')
+        again = LogInfo(msg=f'sensor_logger_node exited with {event.returncode}: it is restarted in {RESTART_AFTER_S:g} s')
         return [again, TimerAction(period=RESTART_AFTER_S, actions=logger(namespace, parameters))]
 
     return [RegisterEventHandler(OnProcessExit(target_action=node, on_exit=ended)), node]
 
 
 def command(*arguments: str | LaunchConfiguration, condition: Condition) -> Action:
-    """A verb of ``shadowhound-data``, which starts again whatever ends it. ``Node`` would append --ros-args, which it refuses."""
+    """A verb of ``shadowhound-data``, always restarted. Not a ``Node``, which would append --ros-args."""
     return ExecuteProcess(
         cmd=[ExecutableInPackage(package='shadowhound_data_logger', executable='shadowhound-data'), *arguments],
         condition=condition,
@@ -88,18 +88,18 @@ def command(*arguments: str | LaunchConfiguration, condition: Condition) -> Acti
 
 
 def live_page() -> Action:
-    """The page on which the robot can be watched, where it is asked for."""
+    """The live page, with ``live:=true``."""
     bind = LaunchConfiguration('live_bind')
     return command('live', '--spool', str(SPOOL), '--bind', bind, condition=IfCondition(LaunchConfiguration('live')))
 
 
 def policies() -> Action:
-    """What follows the registry for a trained policy, where one is named."""
+    """The process that follows the registry for a trained policy, with ``policy:=NAME``."""
     return command('policy', 'run', '--name', LaunchConfiguration('policy'), condition=LaunchConfigurationNotEquals('policy', ''))
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What `ros2 launch` asks for."""
+    """The entry point of `ros2 launch`."""
     return LaunchDescription(
         [
             DeclareLaunchArgument('params_file', default_value='', description='The parameter file.'),

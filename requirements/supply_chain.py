@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Says what the package consists of, and what is known against it: ``make sbom`` and ``make audit``.
+"""What the package consists of, and its known vulnerabilities: ``make sbom`` and ``make audit``.
 
     sbom    build/sbom/LOCK.cdx.json of each lock file that users install, and vendored.cdx.json of what is bundled here:
             CycloneDX 1.6, with versions, package URLs and SHA-256 or SHA-512 of every file that may be installed
-    audit   known vulnerabilities of the pins, also of those in the image of MLflow; exit code 1 where there are some, 0 where the
-            database cannot be reached, with a line that says when it was reached last
+    audit   known vulnerabilities of the pins, also of those in the image of MLflow; exit code 1 if there are any, 0 if the
+            database cannot be reached, with the time at which it was last reached
 
-The tools have an environment of their own, .cache/audit, from requirements/audit.txt.
+The tools have a separate environment, .cache/audit, from requirements/audit.txt.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def sbom(folder: Path) -> int:
 
 
 def write(target: Path, content: dict[str, Any]) -> None:
-    """Write a bill of materials, which says of what it is one: this package, as package.xml has it."""
+    """Write a bill of materials of this package, with name, version and licenses as in package.xml."""
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own
     name, version = manifest.findtext('name'), manifest.findtext('version')
     license_ = [{'license': {'id': each.text}} for each in manifest.findall('license')]
@@ -73,7 +73,7 @@ def write(target: Path, content: dict[str, Any]) -> None:
 
 
 def vendored() -> Iterator[dict[str, Any]]:
-    """What others wrote and the repository holds: what is in the bundles of the live page."""
+    """The libraries in the bundles of the live page."""
     locked: Mapping[str, Any] = json.loads(PAGE.read_text(encoding='utf-8'))['packages']
     for name, version, license_ in _BUNDLED.findall(LICENSES.read_text(encoding='utf-8')):
         at = locked[f'node_modules/{name}']
@@ -88,20 +88,20 @@ def vendored() -> Iterator[dict[str, Any]]:
 
 
 def audit() -> int:
-    """Print what is known of the pins; the exit code. A machine that does not reach the database says so in a line."""
+    """Print the known vulnerabilities of the pins; the exit code. An unreachable database is reported in one line."""
     first = re.findall(r'^(\S+)==(\S+)', AUDITED[0].read_text(encoding='utf-8'), re.MULTILINE)[0]
     if not reachable(url := f'{database()}/{first[0]}/{first[1]}/json'):
-        print(f'audit: skipped, {url} does not say within {ANSWER_S:g} s what is known; {last_reached()}')
+        print(f'audit: skipped, {url} does not answer within {ANSWER_S:g} s; {last_reached()}')
         return 0
     try:
         tools()
         lines, asked = judged([row for lock in AUDITED for row in audited(lock)])
     except (subprocess.SubprocessError, OSError, ValueError, LookupError) as error:
-        print(f'audit: skipped, pip-audit gives no answer: {str(error)[:200]}; {last_reached()}')
+        print(f'audit: skipped, pip-audit failed: {str(error)[:200]}; {last_reached()}')
         return 0
     REACHED.parent.mkdir(exist_ok=True)
     REACHED.write_text(f'{datetime.now(timezone.utc).isoformat(timespec="seconds")}\n', encoding='utf-8')
-    print('\n'.join(lines) or f'audit: nothing is known against {asked} packages')
+    print('\n'.join(lines) or f'audit: no known vulnerability in {asked} packages')
     return 1 if lines else 0
 
 
@@ -113,7 +113,7 @@ def last_reached() -> str:
     except FileNotFoundError:
         return 'it has never been reached from here'
     except (OSError, ValueError, TypeError) as error:
-        return f'when it was reached last is unknown ({error})'
+        return f'when it was last reached is unknown ({error})'
     return f'it was last reached at {then.isoformat()}, {days} days ago'
 
 
@@ -127,10 +127,10 @@ def audited(lock: Path) -> list[dict[str, Any]]:
 
 
 def judged(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], int]:
-    """A line for each vulnerability, and of how many packages the database knew something."""
+    """A line for each vulnerability, and how many packages the database has."""
     known = {row['name']: row for row in rows if 'skip_reason' not in row}
     lines = {
-        f'{row["name"]} {row["version"]}: {one["id"]}, mended in {", ".join(one["fix_versions"]) or "no version"}'
+        f'{row["name"]} {row["version"]}: {one["id"]}, fixed in {", ".join(one["fix_versions"]) or "no version"}'
         for row in rows
         for one in row.get('vulns', ())
     }
@@ -138,7 +138,7 @@ def judged(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], int]:
 
 
 def database() -> str:
-    """The URL below which each version of a package has what is known of it: of PyPI, as pip has it; empty without pip."""
+    """The URL of PyPI below which each version of a package has its vulnerabilities; empty without pip."""
     try:
         from pip._internal.models.index import PyPI  # noqa: PLC0415
     except ImportError:
@@ -147,7 +147,7 @@ def database() -> str:
 
 
 def reachable(url: str) -> bool:
-    """Whether it answers in time, with JSON: a proxy's page says nothing."""
+    """Whether it answers before the deadline with JSON, not with the page of a proxy."""
     try:
         with urllib.request.urlopen(url, timeout=ANSWER_S) as answer:  # noqa: S310 - https, ours
             return 'vulnerabilities' in json.load(answer)
@@ -156,7 +156,7 @@ def reachable(url: str) -> bool:
 
 
 def tools() -> None:
-    """Make the environment of the tools, or bring it up to date. Raises subprocess.CalledProcessError without a registry."""
+    """Install or update the environment of the tools. Raises subprocess.CalledProcessError without a registry."""
     wanted = (ROOT / 'requirements' / 'audit.txt').read_text(encoding='utf-8')
     done = TOOLS / 'done'
     if done.is_file() and done.read_text(encoding='utf-8') == wanted:

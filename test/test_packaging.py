@@ -131,11 +131,14 @@ def test_every_import_is_a_dependency() -> None:
         ('docs.txt', ['docs.in']),
         ('runtime.txt', ['runtime.in']),
         ('robot.txt', ['runtime.in']),
-        ('wheels.txt', ['runtime.in', 'ros.in', 'dev.in']),
-        ('sourced.txt', ['runtime.in', 'dev.in']),
-        ('lyrical.txt', ['runtime.in', 'dev.in']),
+        ('wheels.txt', ['runtime.in', 'ros.in', 'demo.in', 'dev.in']),
+        ('demo_wheels.txt', ['runtime.in', 'ros.in', 'demo.in']),
+        ('sourced.txt', ['runtime.in', 'demo.in', 'dev.in']),
+        ('demo_sourced.txt', ['runtime.in', 'demo.in']),
+        ('lyrical.txt', ['runtime.in', 'demo.in', 'dev.in']),
+        ('demo_lyrical.txt', ['runtime.in', 'demo.in']),
         ('jazzy.txt', ['ros.in']),
-        ('kilted_wheels.txt', ['runtime.in', 'kilted.in', 'dev.in']),
+        ('kilted_wheels.txt', ['runtime.in', 'kilted.in', 'demo.in', 'dev.in']),
     ],
 )
 def test_a_lock_file_has_its_requirements(lock: str, sources: list[str]) -> None:
@@ -145,6 +148,14 @@ def test_a_lock_file_has_its_requirements(lock: str, sources: list[str]) -> None
     text = (REQUIREMENTS / lock).read_text()
     pins = re.findall(r'^[a-z0-9_.-]+==.*\\\n    --hash=sha256:', text, re.MULTILINE)
     assert len(pins) == len(re.findall(r'^[a-z0-9_.-]+==', text, re.MULTILINE))
+
+
+@pytest.mark.parametrize('lock', ['wheels.txt', 'sourced.txt', 'lyrical.txt'])
+def test_the_demo_has_the_versions_of_the_tests(lock: str) -> None:
+    """What `make demo` installs stays when `make test` installs the rest, and is less."""
+    some, every = (set(re.findall(r'^(\S+==[^ ;]+)', (REQUIREMENTS / name).read_text(), re.MULTILINE))
+                   for name in (f'demo_{lock}', lock))  # fmt: skip
+    assert some < every
 
 
 @pytest.mark.parametrize('lock', ['robot.txt', 'sourced.txt', 'jazzy.txt'])

@@ -18,9 +18,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from shadowhound_data_logger.core.config import default_robot, home
+from shadowhound_data_logger.core.config import home
 from shadowhound_data_logger.core.errors import BagError
-from shadowhound_data_logger.spool.local_robot import local_robot
+from shadowhound_data_logger.spool.local_robot import robot_of_recorder
 
 PROGRAM: Final = 'shadowhound_data_logger.node.recording.bag_process'
 DEADLINE_S: Final = 60.0
@@ -76,7 +76,7 @@ def record(name: str, duration_s: float, *, topics: Sequence[str] = (), regex: s
     ``robot`` is by default the robot of this machine, as for a node without that parameter. Raises BagError, and SettingError
     where nodes of several robots share this machine.
     """
-    robot = robot or local_robot(os.environ, home(os.environ) / 'spool') or default_robot(os.environ)
+    robot = robot or robot_of_recorder(os.environ, home(os.environ) / 'spool')
     command = [sys.executable, '-m', PROGRAM, f'--duration={duration_s}', f'--deadline={deadline_s}', f'--robot={robot}']
     command += [f'--topic={topic}' for topic in topics] + ([f'--regex={regex}'] if regex else []) + ['--', name]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:

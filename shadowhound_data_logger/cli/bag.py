@@ -147,8 +147,8 @@ def bag_list(*, since: str, robot: str | None, as_json: bool) -> ExitCode:
     Exit code 1 if something is wrong with a bag, or if the store is unreachable: then only the bags on this machine are
     listed.
     """  # noqa: D301 - click's mark for lines that are not wrapped
-    robot = the_robot(robot, in_store=True)
     begin_ns = moment('--since', since, SystemClock.of_this_machine().wall_ns()) if since else 0
+    robot = the_robot(robot, in_store=True)
     with the_store(STORE_THREADS) as store:
         where, away = store.describe(), ''
         try:

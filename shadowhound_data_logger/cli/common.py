@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, MutableMapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager
 from enum import IntEnum
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
-from shadowhound_data_logger.core.config import UploadSettings, default_robot, home, store_settings
+from shadowhound_data_logger.core.config import UploadSettings, home, store_settings
 from shadowhound_data_logger.core.errors import NameRefused, SettingError, StoreError
 from shadowhound_data_logger.core.keys import check_name, is_name
 from shadowhound_data_logger.core.options import StoreSettings
@@ -158,29 +158,40 @@ spool_folder = click.option(
 )
 
 
-def the_robot(named: str | None, spool: Path | None = None, *, in_store: bool = False, must_exist: bool = False) -> str:
+def the_robot(named: str | None, spool: Path | None = None, *, in_store: bool = False) -> str:
     """The robot that a verb is about.
 
-    The named one, otherwise that of this machine (``local_robots``); with ``in_store`` otherwise the only one of the store. If
-    there is none of these, it is the default of the node. Raises BadUsage if there are several, or none and it ``must_exist``.
+    The named one, otherwise that of this machine (``local_robots``); with ``in_store`` otherwise the only one of the store.
+    Raises BadUsage if there are several, or none.
     """
     from shadowhound_data_logger.spool.local_robot import local_robots  # noqa: PLC0415 - SQLite
 
     if named:
         return named
-    found = local_robots(os.environ, the_spool(spool))
+    found, where = local_robots(os.environ, the_spool(spool)), ''
     if not found and in_store:
-        found = the_store_robots()
-    if len(found) > 1 or (must_exist and not found):
-        raise BadUsage(f'which robot? There are {", ".join(found) or "none"}', '--robot NAME, or set SHADOWHOUND_ROBOT')
-    return found[0] if found else default_robot(os.environ)
+        found, where = the_store_robots()
+    if not found:
+        what = f'no robot found: no node has run with the spool {the_spool(spool)}{where}'
+        raise BadUsage(what, 'add --robot NAME, or set SHADOWHOUND_ROBOT; SHADOWHOUND_HOME is the folder of the spool')
+    return only_robot(found)
 
 
-def the_store_robots() -> list[str]:
-    """Robots with data in the store; none if it cannot be read, which the verb reports itself."""
-    with suppress(StoreError), the_store(1) as store:
-        return [name for name in store.folders('sensor-data') if is_name(name)]
-    return []
+def only_robot(found: Sequence[str]) -> str:
+    """The only name, empty if there is none. Raises BadUsage if there are several."""
+    if len(found) > 1:
+        raise BadUsage(f'which robot? There are {", ".join(found)}', 'add --robot NAME, or set SHADOWHOUND_ROBOT')
+    return found[0] if found else ''
+
+
+def the_store_robots() -> tuple[list[str], str]:
+    """Robots with data in the store, and why there are none."""
+    with the_store(1) as store:
+        try:
+            found = [name for name in store.folders('sensor-data') if is_name(name)]
+        except StoreError as error:
+            return [], f', and {error}'
+        return found, f', and there is no data in {store.describe()}'
 
 
 def the_home() -> Path:

@@ -236,7 +236,7 @@ def _me() -> str:
 
 
 def _named(robot: str | None) -> str:
-    return the_robot(robot, in_store=True, must_exist=True)
+    return the_robot(robot, in_store=True)
 
 
 def _place(key: str, robot: str) -> tuple[str, str]:

@@ -26,7 +26,6 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
-from shadowhound_data_logger.core.config import default_robot
 from shadowhound_data_logger.core.dataclass_json import parse
 from shadowhound_data_logger.core.stamps import SAME_NS, StampReport, describe
 from shadowhound_data_logger.core.times import moment
@@ -110,14 +109,15 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
         'robots': names if len(names) > 1 else [robot],  # a spool that several share has one ledger of them all
     }
     if as_json:
-        print_json(found)
+        print_json({**found, 'robot': robot or None, 'robots': [name for name in found['robots'] if name]})
     else:
         print_page(*page(found))
     return exit_code(finding=not found['balanced'])
 
 
 def _robot(folder: Path) -> str:
-    return next(iter(local_robots(os.environ, folder)), default_robot(os.environ))
+    """Empty if no node has run here."""
+    return next(iter(local_robots(os.environ, folder)), '')
 
 
 def _is_asked_for(gap: Gap, topic: str, begin_ns: int | None, end_ns: int | None, cause: str) -> bool:
@@ -195,7 +195,7 @@ def _is_silent(row: TopicFigures) -> bool:
 
 
 def _whose(found: LedgerPage) -> str:
-    return ' and '.join(found['robots'])
+    return ' and '.join(filter(None, found['robots'])) or 'this spool'
 
 
 def _table(title: str, topics: Mapping[str, TopicFigures]) -> RenderableType:

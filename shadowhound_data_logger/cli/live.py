@@ -22,17 +22,17 @@ from shadowhound_data_logger.cli.common import (
     ExitCode,
     as_json,
     examples,
+    only_robot,
     robot_name,
     spool_folder,
     the_home,
-    the_robot,
     the_spool,
     the_store_settings,
 )
 from shadowhound_data_logger.cli.output import print_json
 from shadowhound_data_logger.core import heap
-from shadowhound_data_logger.core.config import DEFAULT_ROBOT
 from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.spool.local_robot import local_robots
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.live.server import LiveServer, LiveSettings
@@ -148,7 +148,7 @@ def as_it_is(given: LiveSettings, *, is_robot: bool) -> LiveSettings:
         waits += (
             'Until one starts, this page shows the store.' if is_of_store else 'The page shows its data as soon as one starts.'
         )
-    robot = given.robot or (DEFAULT_ROBOT if is_of_store else the_robot(None, given.spool))
+    robot = given.robot or only_robot([] if is_of_store else local_robots(os.environ, given.spool))
     return replace(given, robot=robot, is_of_store=is_of_store, waits=waits)
 
 

@@ -14,7 +14,7 @@ import click
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_home, the_robot
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_home
 from shadowhound_data_logger.cli.output import (
     duration,
     number,
@@ -117,13 +117,16 @@ def resume(*, timeout: float, experiment: str | None, as_json: bool) -> ExitCode
     Exit code 1 if something is left after --timeout; sending continues for ten more minutes in the background.
     """
     where = the_home()
-    if not _late(overviews(where)):
+    robots = sorted({each.robot for each in _late(overviews(where))})
+    if not robots:
         if as_json:
             print_json({'left': []})
         else:
             click.echo('Nothing is left to send.')
         return ExitCode.FINE
-    replayer = Replayer(where, experiment or f'{the_robot(None)}_missions', os.environ)
+    if len(robots) > 1 and not experiment:
+        raise BadUsage(f'these missions are of several robots: {", ".join(robots)}', 'add --experiment NAME')
+    replayer = Replayer(where, experiment or f'{robots[0]}_missions', {'SHADOWHOUND_ROBOT': robots[0], **os.environ})
     replayer.start()
     replayer.wake()
     try:

@@ -284,6 +284,6 @@ def _telling() -> Iterator[None]:
         yield
 
 
-def _no_mission(robot: str = '') -> Callable[[], bool]:
-    missions = MissionFinder(the_home(), the_robot(robot or None))
+def _no_mission(robot: str | None = None) -> Callable[[], bool]:
+    missions = MissionFinder(the_home(), robot)
     return lambda: missions.active() is None

@@ -90,7 +90,7 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: i
         from shadowhound_data_logger.lake.row_files import robots  # noqa: PLC0415
 
         source, left_out = default_source(the_store_settings()), quietly()
-        robot = the_robot(flags.get('robot'), in_store=True, must_exist=True)
+        robot = the_robot(flags.get('robot'), in_store=True)
         check_name_of('robot', robot, robots(source))
         name = user or lake.requester()
         if not is_name(name):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -40,7 +39,6 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock
-from shadowhound_data_logger.core.config import default_robot
 from shadowhound_data_logger.core.errors import PolicyError
 from shadowhound_data_logger.core.status import BagStatus, EventStatus, NodeStatus, SpoolStatus, TopicStatus
 from shadowhound_data_logger.core.times import iso_ns
@@ -121,7 +119,7 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
 
 def _look(spool: Path, robot: str | None, clock: Clock) -> Page:
     """The requested robot, or the first that runs, or the first that has a status."""
-    names = [robot] if robot else robots(spool) or [default_robot(os.environ)]
+    names = [robot] if robot else robots(spool) or ['']
     found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each.running), found[0])
     others = tuple(each.robot for each in found if each.running == chosen.running and each is not chosen)
@@ -196,6 +194,8 @@ def _fine(topics: Mapping[str, TopicStatus]) -> str:
 def _head(report: NodeReport) -> Text:
     state, style = HEADS[report.state]
     node = report.node
+    if not report.robot:
+        return Text.assemble((state, style), '; no node has run here yet')
     head = Text.assemble(plain(report.robot, 'bold'), '  ', (state, style))
     if report.state == NOT_RUNNING:
         return head.append_text(plain(_ended(report.session)))

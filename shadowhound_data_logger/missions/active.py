@@ -50,9 +50,9 @@ class ActiveMission:
 
 
 class MissionFinder:
-    """Finds a robot's active mission; if there are several, the one that started last. Not thread-safe."""
+    """Finds the active mission of a robot, or of any (None); of several, the one that started last. Not thread-safe."""
 
-    def __init__(self, home: Path, robot: str) -> None:
+    def __init__(self, home: Path, robot: str | None) -> None:
         self._home = home
         self._folder = home / MISSIONS
         self._robot = robot
@@ -100,7 +100,7 @@ class MissionFinder:
             return None
         if not start:
             return None
-        if not is_locked or start.get('k') != 'start' or start.get('robot') != self._robot:
+        if not is_locked or start.get('k') != 'start' or self._robot not in (None, start.get('robot')):
             self._forget(name)
             return None
         self._starts[name] = start

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SystemClock
-from shadowhound_data_logger.core.config import default_robot
 from shadowhound_data_logger.core.config import home as home_of
 from shadowhound_data_logger.core.errors import NameRefused, SettingError
 from shadowhound_data_logger.core.keys import check_name
@@ -31,7 +30,7 @@ from shadowhound_data_logger.missions.new_run import RunRequests
 from shadowhound_data_logger.missions.overview import Report, has_arrived, report, sizes
 from shadowhound_data_logger.missions.state import FAILED, KILLED
 from shadowhound_data_logger.missions.values import text
-from shadowhound_data_logger.spool.local_robot import local_robot
+from shadowhound_data_logger.spool.local_robot import robot_of_recorder
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +62,7 @@ class MissionDataLogger:
 
         Args:
             robot: the robot's name, the first part of every key. By default ``SHADOWHOUND_ROBOT``, otherwise the robot whose node
-                has run on this machine, otherwise the name that a node here would have.
+                has run on this machine, otherwise, with a warning, the name that a node here would have.
             home: the folder of journals and spool. By default ``SHADOWHOUND_HOME``, otherwise ``~/.shadowhound``.
             tracking_uri: the MLflow server. By default ``MLFLOW_TRACKING_URI``, otherwise a SQLite file in ``home``.
             experiment: the MLflow experiment. By default ``ROBOT_missions``.
@@ -78,7 +77,7 @@ class MissionDataLogger:
         uri = _text('tracking_uri', tracking_uri)
         environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': uri} if uri else {})
         self.home = _home(environ | ({'SHADOWHOUND_HOME': given} if (given := _text('home', home)) else {}))
-        self.robot = _robot(_text('robot', robot) or local_robot(environ, self.home / 'spool') or default_robot(environ))
+        self.robot = _robot(_text('robot', robot) or robot_of_recorder(environ, self.home / 'spool'))
         experiment = _text('experiment', experiment) or f'{self.robot}_missions'
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
         self._start_timeout_s = _seconds('start_timeout_s', start_timeout_s)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 
 from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import default_robot
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.keys import is_name
+
+log = logging.getLogger(__name__)
 
 
 def robots(spool: Path) -> list[str]:
@@ -35,3 +39,15 @@ def local_robot(environ: Mapping[str, str], spool: Path) -> str | None:
     if len(found) > 1:
         raise SettingError('SHADOWHOUND_ROBOT', '', f'one of {", ".join(found)}: their nodes share this machine')
     return found[0] if found else None
+
+
+def robot_of_recorder(environ: Mapping[str, str], spool: Path) -> str:
+    """The robot of what a program here records: ``local_robot``, or with a warning the name that a node here would have.
+
+    Raises SettingError if there are several.
+    """
+    if found := local_robot(environ, spool):
+        return found
+    name = default_robot(environ)
+    log.warning('no node has run here (%s), and SHADOWHOUND_ROBOT is not set: the robot is called %s', spool, name)
+    return name

@@ -47,6 +47,7 @@ class NodeReport:
     """The status of the node of a robot."""
 
     robot: str
+    """Empty if no node has run here."""
     state: str
     """``running``, ``not_answering`` (its process exists but writes no status) or ``not_running``."""
     age_s: float | None
@@ -74,7 +75,7 @@ class NodeReport:
             found['session'] = as_plain(self.session)
         if self.problem:
             found['problem'] = self.problem
-        return {'robot': self.robot, **node, **found, 'findings': list(self.findings)}
+        return {'robot': self.robot or None, **node, **found, 'findings': list(self.findings)}
 
 
 def file(spool: Path, robot: str) -> Path:

@@ -72,12 +72,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, mlflow: bool = True,
         keeps: bool = False, arm: bool = False) -> int:  # fmt: skip
     """Run everything, from an empty folder to the verdict; with ``keeps`` the page and the Tower stay until Ctrl-C."""
-    console.print(f'[bold]A Go2 on patrol for {duration_s:g} s, its data logger, and a Tower.')
+    console.print(f'[bold]A simulated Go2 on patrol for {duration_s:g} s, its data logger, and a server.')
     console.print(f'Everything runs on this machine, in {folder}/\n')
     if importlib.util.find_spec('go2_interfaces') is None:
         console.print('[yellow]go2_interfaces is not installed[/] (make setup builds it where there is a g++):')
         console.print('/imu, /go2_states and /lowstate are skipped.\n')
-    console.print('Starting the Tower, an S3 server and MLflow (about ten seconds) ...')
+    console.print('Starting the server: S3 and MLflow (about ten seconds) ...')
     for name in NO_PROXY:
         os.environ[name] = ','.join(filter(None, (os.environ.get(name), '127.0.0.1')))
     with ExitStack() as stack:
@@ -182,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
         '--outage', type=float, default=10.0, metavar='S', help='seconds without the S3 server (default 10; 0: none)'
     )
     parser.add_argument('--folder', type=Path, default=Path('demo'), help='folder of the demo (default demo)')
-    parser.add_argument('--keep', action='store_true', help='keep the live page and the Tower afterwards, until Ctrl-C')
+    parser.add_argument('--keep', action='store_true', help='keep the live page and the server running afterwards, until Ctrl-C')
     parser.add_argument('--arm', action='store_true', help='with a simulated SO-ARM100, its clock 37 ms ahead (docs/datasets.md)')
     parser.add_argument('--no-mlflow', dest='mlflow', action='store_false', help='the S3 server only, which starts sooner')
     return parser

@@ -22,9 +22,9 @@ from shadowhound_sim.demo_run import Record, Show, SpoolReading
 
 LINE_EVERY_S: Final = 5.0
 """Without a terminal."""
-HEADING: Final = f'{"time":>5}  {"room":<9}{"messages":>9}{"objects":>9}{"delivered":>11}{"waiting":>9}{"size":>10}  Tower'
+HEADING: Final = f'{"time":>5}  {"room":<9}{"messages":>9}{"objects":>9}{"delivered":>11}{"waiting":>9}{"size":>10}  server'
 TEAL: Final = '#16917f'
-TOWER: Final = {'up': 'up', 'going': 'going away', 'away': 'AWAY', 'coming': 'AWAY', 'back': 'up again'}
+TOWER: Final = {'up': 'up', 'going': 'stopping', 'away': 'DOWN', 'coming': 'DOWN', 'back': 'up again'}
 
 
 @contextmanager
@@ -160,12 +160,13 @@ def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], c
     console.print(f'  {folder}/node.log: the log of the node', soft_wrap=True)
     if page:
         console.print(f'\n[bold]The live page stays, with the whole patrol to look back at: {page}')
-        console.print('Ctrl-C stops it, and the Tower.')
+        console.print('Ctrl-C stops it, and the server.')
         return
     console.print('\n[bold]Look at the bucket')
-    console.print('The Tower has stopped, its data stay. Start it again, with new credentials:')
+    console.print('The server has stopped; its data is kept. To start it again, with new credentials:')
     console.print(f'  {prefix}python -m shadowhound_tower.embedded --folder {place}/tower', soft_wrap=True)
-    console.print('Paste the "export" lines it prints into another terminal, and use any S3 client:')
+    console.print('Paste the "export" lines it prints into another terminal, and use our commands or any S3 client:')
+    console.print(f'  {prefix}shadowhound-data query --sensor camera --limit 5', soft_wrap=True)
     console.print('  aws s3 ls --recursive s3://sensor-data/ --endpoint-url "$AWS_ENDPOINT_URL"', soft_wrap=True)
     console.print('It also prints the URL of MLflow and the user for its pages: experiment thor_missions has the mission.')
     console.print('The ledger again, as on a robot:')
@@ -173,7 +174,7 @@ def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], c
 
 
 def _styled(reading: SpoolReading) -> Text:
-    style = {'AWAY': 'yellow', 'going away': 'yellow', 'up again': 'green'}.get(TOWER[reading.tower], '')
+    style = {'DOWN': 'yellow', 'stopping': 'yellow', 'up again': 'green'}.get(TOWER[reading.tower], '')
     text = Text(line(reading))
     text.stylize(style, len(text) - len(TOWER[reading.tower]))
     return text

@@ -13,6 +13,7 @@ import pty
 import re
 import select
 import shlex
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -23,6 +24,8 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
+from spool.making import new_spool
 from spool.test_status import written
 
 import shadowhound_data_logger
@@ -209,7 +212,7 @@ def test_a_specific_remedy_takes_precedence() -> None:
     (['bag', 'list', '--since', 'soon'], ExitCode.USAGE, "--since = 'soon' is refused", 'allowed is now, today'),
     (['bag', 'list', '--robot', '../x'], ExitCode.USAGE, 'the robot name', 'letters'),
     (['bag', 'info', './none'], ExitCode.USAGE, 'there is no folder ./none', f'{PROGRAM} bag list'),
-    (['bag', 'info', 'none'], ExitCode.USAGE, 'none', '--robot'),
+    (['bag', 'info', 'none', '--robot', 'thor'], ExitCode.USAGE, 'none', '--robot'),
     (['missions', 'show', 'x'], ExitCode.USAGE, "there is no mission or run with the id 'x'", f'{PROGRAM} missions list'),
     (['ledger', '--topic', '/imu'], ExitCode.USAGE, 'choose among gaps', '--gaps'),
     (['ledger', '--since', 'now', '--gaps', '--until', 'x'], ExitCode.USAGE, "--until = 'x' is refused", 'allowed is now'),
@@ -376,12 +379,56 @@ def test_verbs_use_the_robot_of_this_machine(spool: Path, capsys: pytest.Capture
         cli(['bag', 'list'], standalone_mode=False)
 
 
-def test_an_ambiguous_robot_is_wrong_usage(spool: Path) -> None:
-    """Not even the store: it is the node's default, unless something must exist."""
-    assert the_robot(None, in_store=True) == 'thor'
-    with pytest.raises(BadUsage, match='none'):
-        the_robot(None, in_store=True, must_exist=True)
+@pytest.mark.parametrize('arguments', [
+    ['bag', 'list'], ['bag', 'upload', '.'], ['bag', 'watch', '.'], ['pull', '--sensor', 'camera'],
+    ['label', 'add', 'keep', '--since', '1h', '--until', 'now'], ['policy', 'sync', '--name', 'patrol'],
+])  # fmt: skip
+def test_a_verb_that_finds_no_robot_names_the_folder(
+    spool: Path, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Even where the messages of a Go2 are installed, no name is assumed."""
+    (spool.parent / 'share/go2_interfaces').mkdir(parents=True)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(spool.parent))
+    monkeypatch.chdir(spool)
+    monkeypatch.setattr(sys, 'argv', ['shadowhound-data', *arguments])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    told = ' '.join(capsys.readouterr().err.split())
+    assert caught.value.code == ExitCode.USAGE
+    assert f'no robot found: no node has run with the spool {spool}' in told
+    assert 'add --robot NAME, or set SHADOWHOUND_ROBOT' in told
     assert not list(spool.iterdir())
+
+
+def test_a_status_without_a_robot_names_none(spool: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing has run, and of a spool that only an agent or an upload has used."""
+    (spool.parent / 'share/go2_interfaces').mkdir(parents=True)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(spool.parent))
+    answer = CliRunner().invoke(cli, ['status', '--json'], standalone_mode=False)
+    assert (json.loads(answer.stdout)['robot'], answer.return_value) == (None, ExitCode.FINDING)
+    told = ' '.join(CliRunner().invoke(cli, ['status'], standalone_mode=False).stdout.split())
+    assert told.startswith('not running; no node has run here yet')
+    assert f'there is no spool in {spool}: start the node' in told
+    index = new_spool(spool)
+    index.open()
+    index.close()
+    assert 'thor' not in CliRunner().invoke(cli, ['status'], standalone_mode=False).stdout
+    answer = CliRunner().invoke(cli, ['ledger'], standalone_mode=False)
+    assert 'No message of this spool has been received yet' in answer.stdout
+    found = json.loads(CliRunner().invoke(cli, ['ledger', '--json'], standalone_mode=False).stdout)
+    assert (found['robot'], found['robots']) == (None, [])
+
+
+def test_an_agent_without_a_robot_warns(spool: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """A mission never fails because its robot is not named, but it is not named silently."""
+    monkeypatch.setattr(socket, 'gethostname', lambda: 'turtle')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', '')
+    with closing(MissionDataLogger(replay=False)) as logger:
+        assert logger.robot == 'turtle'
+    assert 'the robot is called turtle' in caplog.text
+    caplog.clear()
+    with closing(MissionDataLogger(robot='rover', replay=False)):
+        assert not caplog.text
 
 
 FILE = Path(__file__).parents[2] / 'resource/completion/shadowhound-data'

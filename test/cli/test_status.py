@@ -301,7 +301,7 @@ def test_without_a_node_the_spool_is_shown(tmp_path: Path) -> None:
     spool.open()
     put(spool, make('a', b'12345'))
     spool.close()
-    result = run(tmp_path / 'spool')
+    result = run(tmp_path / 'spool', '--robot', 'thor')
     assert result.return_value == 1
     assert 'thor  not running; last session 2025-10-18 12:00:00 to 2025-10-18 12:00:00 UTC' in result.stdout
     assert '1 objects wait' in result.stdout

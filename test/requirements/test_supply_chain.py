@@ -74,7 +74,7 @@ def test_a_skipped_audit_names_the_last_one(
     for damaged in ('', 'never', '2026-11-01'):
         reached.write_text(damaged)
         assert supply_chain.audit() == 0
-        assert 'when it was reached last is unknown' in capsys.readouterr().out
+        assert 'when it was last reached is unknown' in capsys.readouterr().out
 
 
 def test_known_vulnerabilities_are_reported_once(
@@ -89,7 +89,7 @@ def test_known_vulnerabilities_are_reported_once(
     for name, answer in (('reachable', True), ('tools', None), ('audited', rows)):
         monkeypatch.setattr(supply_chain, name, lambda *_, answer=answer: answer)
     assert supply_chain.audit() == 1
-    assert capsys.readouterr().out == 'a 1: CVE-1, mended in 2\n'
+    assert capsys.readouterr().out == 'a 1: CVE-1, fixed in 2\n'
     assert supply_chain.judged(rows[1:]) == ([], 1)
 
 

@@ -404,7 +404,7 @@ def test_a_short_demo_succeeds(tmp_path: Path) -> None:
         assert run.wait(200) == 0, said + (tmp_path / 'errors').read_text()
     assert 'The ledger balances' in said
     assert 'all as spooled' in said
-    assert 'AWAY' in said
+    assert 'DOWN' in said
     assert 'The mission patrol_' in said
     assert (tmp_path / 'errors').read_text() == ''
     assert json.loads((folder / 'ledger.json').read_text())['balanced'] is True

@@ -102,7 +102,7 @@ function take(head, body) {
     rewatch();
   } else if (kind === 'figures') {
     figures.value = { ...head.figures, at: head.at };
-    document.title = `${head.figures.robot} · live`;
+    document.title = `${head.figures.robot ?? 'No robot'} · live`;
     rewatch();
   } else if (kind === 'problem') {
     tellProblem(head);
@@ -201,7 +201,7 @@ function Head({ onSignIn }) {
     await fetch('/api/sign-out', { method: 'POST', headers: { 'X-CSRF-Token': session.value.csrf } });
     location.reload();
   };
-  return html`<header><a class="skip" href="#data">Skip to the data</a><img src="icon.svg" alt="" width="30" height="30" /><h1 title=${session.value?.robot}>${session.value?.robot ?? 'Live'}</h1>
+  return html`<header><a class="skip" href="#data">Skip to the data</a><img src="icon.svg" alt="" width="30" height="30" /><h1 title=${session.value?.robot}>${session.value?.robot || 'Live'}</h1>
     <span class=${`pill ${kind}`} role="status">${text}</span>
     ${!past.value && session.value.has_live && html`<nav aria-label="Parts of this page"><a href="#now">Now</a><a href="#data">The data</a><a href="#gaps">Gaps</a></nav>`}
     <span class="spacer"></span>${told && html`<${Age} kind="figures" />`}
