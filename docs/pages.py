@@ -245,6 +245,11 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
         'With `off`, ports of killed listeners are not repaired ([why](reliability.md#limits)).',
     ),
     (
+        'SHADOWHOUND_TYPE_SUPPORT',
+        '`on`',
+        'With `off`, topics need their message package ([why](decisions/0027-type-supports-from-definitions.md)).',
+    ),
+    (
         'AWS_SHARED_CREDENTIALS_FILE',
         '`~/.aws/credentials`',
         'The keys, if the two variables are not set; read again when the server rejects them ([how](thor.md#rotate-keys)).',

@@ -46,6 +46,7 @@ from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 from std_msgs.msg import String
 
 from shadowhound_data_logger.core.clock import MAX_AGE_NS
+from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.ros import librcl
@@ -112,15 +113,41 @@ class TypeUnavailable(LookupError):
     """Messages of a type cannot be received here; the text is the reason, a sentence without its period."""
 
 
+class NotInstalled(TypeUnavailable):
+    """The message package of a type is not installed here, or not for this Python."""
+
+
 class SubscriptionRefused(RuntimeError):
-    """The middleware rejects the subscription: this node has the topic with another type, or the name is invalid in ROS."""
+    """The middleware rejects the subscription: this node has the topic with another type, or the name is invalid in ROS.
+
+    Or a publisher has another definition of the type than the one that its class was made from.
+    """
 
 
+@lru_cache
 def message_class(type_name: str) -> type:
-    """The rclpy class of ``package/msg/Name``, ``package/srv/Name_Event`` or ``package/action/Name_FeedbackMessage``.
+    """The class to subscribe with to ``package/msg/Name``, ``package/srv/Name_Event`` or ``package/action/Name_FeedbackMessage``.
 
-    Raises TypeUnavailable. The name may come from any machine in the network: a package is imported only if it has interfaces
-    of this kind, because an import executes its code.
+    If its package is not installed and its definition is known, it is one that is made from that. Raises TypeUnavailable.
+    """
+    try:
+        return installed_class(type_name)
+    except NotInstalled as missing:
+        from shadowhound_data_logger.ros import type_support  # noqa: PLC0415 - half a second, needed only here
+
+        try:
+            return type_support.make(type_name)
+        except Rejected:  # no definition either
+            raise missing from None
+        except type_support.Unsupported as error:
+            raise TypeUnavailable(f'{missing}, and it cannot be received without it ({error})') from error
+
+
+def installed_class(type_name: str) -> type:
+    """The class in the message package of a type. Raises TypeUnavailable.
+
+    The name may come from any machine in the network: a package is imported only if it has interfaces of this kind, because an
+    import executes its code.
     """
     match = _TYPE.fullmatch(type_name)
     if match is None:
@@ -128,14 +155,14 @@ def message_class(type_name: str) -> type:
     package, kind = match[1], match[2] or match[4]
     if not _is_installed(package, kind):
         text = f'its message package is not installed here ({type_name}: no package {package} with {_KINDS[kind]})'
-        raise TypeUnavailable(text)
+        raise NotInstalled(text)
     try:
         module = import_module(f'{package}.{kind}')
         found: type = getattr(module, match[3]) if match[3] else _part(module, match[5], match[6])
         check_for_type_support(found)
     except UnsupportedTypeSupport as error:  # not an ImportError, although an import failed
         text = f'{type_name}: a library of {package} does not load: is its workspace sourced, and built for this Python?'
-        raise TypeUnavailable(text) from error
+        raise NotInstalled(text) from error
     except AttributeError as error:
         raise TypeUnavailable(f'the package {package} that is installed here has no {type_name}') from error
     except (ImportError, ValueError, TypeError, NoTypeSupportImportedException) as error:
@@ -180,6 +207,30 @@ def unavailable(type_name: str) -> str:
     return ''
 
 
+@lru_cache
+def is_installed(type_name: str) -> bool:
+    """Whether the message package of a type is installed."""
+    try:
+        installed_class(type_name)
+    except TypeUnavailable:
+        return False
+    return True
+
+
+def other_definition(node: Node, topic: str, type_name: str) -> str:
+    """Which publisher has another definition of a type than the one its class was made from, as a sentence; empty if none has.
+
+    ROS nodes announce the hash of their definition since Iron; programs without ROS do not.
+    """
+    made = getattr(message_class(type_name), 'HASH', '')
+    for info in node.get_publishers_info_by_topic(topic) if made else ():
+        theirs = str(info.topic_type_hash)
+        if info.topic_type == type_name and theirs.startswith('RIHS') and theirs != made:
+            whose = printable(f'{info.node_namespace.rstrip("/")}/{info.node_name}')
+            return f'{type_name} is defined differently by {whose}: source the workspace of its publisher'
+    return ''
+
+
 def endpoints(node: Node, topic: str) -> list[Endpoint]:
     """The publishers of a resolved topic in the graph."""
     return [
@@ -204,13 +255,15 @@ class Reader:
     """A live subscription. Created, drained and closed by a single thread: a take after a destroy raises."""
 
     def __init__(self, node: Node, plan: Plan, group: PolledGroup) -> None:
-        """Raises TypeUnavailable if the type is not installed, SubscriptionRefused if the middleware rejects it."""
+        """Raises TypeUnavailable if the type is neither installed nor known, SubscriptionRefused if the middleware rejects it."""
         self.plan = plan
         self.drained_s: float | None = None
         """Time of the last drain, by the monotonic clock."""
         self._node = node
         self._group = group
         self._class = message_class(plan.type)
+        if why := other_definition(node, plan.topic, plan.type):
+            raise SubscriptionRefused(why)
         self._names: dict[bytes, str] = {}
         self._is_stuck = self._has_warned = False
         self._subscription = self._subscribe()

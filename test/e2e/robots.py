@@ -437,15 +437,12 @@ ARM: Mapping[str, Sent] = {
 }  # fmt: skip
 
 
-def unitree(*, has_package: bool) -> Mapping[str, Sent]:
-    """Its vendor topics; those of ``unitree_go`` are logged if that package is installed."""
-    names = iter(('lowstate', 'states', 'wirelesscontroller', 'frontvideostream') if has_package else [''] * 4)
-    return {
-        '/utlidar/cloud': Sent('sensor_msgs/msg/PointCloud2', _cloud('odom'), 1, 'lidar'),
-        '/utlidar/imu': Sent('sensor_msgs/msg/Imu', _imu, 1, 'imu'),
-        '/utlidar/robot_odom': Sent('nav_msgs/msg/Odometry', _odometry('odom', 0.32), 1, 'odom'),
-        '/lowstate': Sent('unitree_go/msg/LowState', {'bms_state.soc': 77, 'power_v': 29.5}, 1, next(names)),
-        '/sportmodestate': Sent('unitree_go/msg/SportModeState', {'body_height': 0.3}, 1, next(names)),
-        '/wirelesscontroller': Sent('unitree_go/msg/WirelessController', {'lx': 0.5}, 1, next(names)),
-        '/frontvideostream': Sent('unitree_go/msg/Go2FrontVideoData', {'video720p': np.arange(9, dtype='u1')}, 1, next(names)),
-    }  # fmt: skip
+UNITREE_TOPICS: Mapping[str, Sent] = {
+    '/utlidar/cloud': Sent('sensor_msgs/msg/PointCloud2', _cloud('odom'), 1, 'lidar'),
+    '/utlidar/imu': Sent('sensor_msgs/msg/Imu', _imu, 1, 'imu'),
+    '/utlidar/robot_odom': Sent('nav_msgs/msg/Odometry', _odometry('odom', 0.32), 1, 'odom'),
+    '/lowstate': Sent('unitree_go/msg/LowState', {'bms_state.soc': 77, 'power_v': 29.5}, 1, 'lowstate'),
+    '/sportmodestate': Sent('unitree_go/msg/SportModeState', {'body_height': 0.3}, 1, 'states'),
+    '/wirelesscontroller': Sent('unitree_go/msg/WirelessController', {'lx': 0.5}, 1, 'wirelesscontroller'),
+    '/frontvideostream': Sent('unitree_go/msg/Go2FrontVideoData', {'video720p': np.arange(9, dtype='u1')}, 1, 'frontvideostream'),
+}  # fmt: skip

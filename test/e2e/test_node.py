@@ -179,22 +179,27 @@ HIDE_GO2 = "import sys\nsys.modules['go2_interfaces'] = None\n"
 
 
 @pytest.mark.long('a node of its own')
-def test_without_go2_interfaces_only_its_topics_are_affected(processes: Processes, tmp_path: Path) -> None:
-    """Its topics log one warning each, and the others continue."""
+@pytest.mark.parametrize('made', ['on', 'off'])
+def test_without_go2_interfaces_only_its_topics_are_affected(processes: Processes, tmp_path: Path, made: str) -> None:
+    """They are received from their definitions; if that is off they log one warning each, and the others continue."""
     (tmp_path / 'hidden').mkdir()
     (tmp_path / 'hidden' / 'sitecustomize.py').write_text(HIDE_GO2)
     environ = without_go2_interfaces()
     environ['PYTHONPATH'] = os.pathsep.join(filter(None, (str(tmp_path / 'hidden'), environ['PYTHONPATH'])))
-    node = processes.node(None, {}, environ=environ)
+    node = processes.node(None, {}, environ=environ | {'SHADOWHOUND_TYPE_SUPPORT': made})
     sim = processes.sim(GENTLE)
     node.received('/odom', 30)
     node.received('/camera/compressed', 10)
+    own = ('/imu', '/go2_states', '/lowstate')
+    for topic in own if made == 'on' else ():
+        node.received(topic, 5)
     sim.signal(signal.SIGINT)
     assert sim.wait() == 0
     ledger = node.stop()
-    assert set(ledger['topics']) == {'/odom', '/joint_states', '/camera/compressed', '/camera/camera_info', '/point_cloud2'}
-    for topic in ('/imu', '/go2_states', '/lowstate'):
-        assert node.log.count(f'{topic} is not logged: its message package is not installed here') == 1
+    others = {'/odom', '/joint_states', '/camera/compressed', '/camera/camera_info', '/point_cloud2'}
+    assert set(ledger['topics']) == others | set(own if made == 'on' else ())
+    for topic in own:
+        assert node.log.count(f'{topic} is not logged: its message package is not installed here') == (made == 'off')
 
 
 def stamped(type_name: str, seconds: int = 0, **fields: Any) -> bytes:

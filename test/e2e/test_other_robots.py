@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import simplejpeg
 from e2e.processes import Processes, until
-from e2e.robots import ARM, ARM_JOINTS, BASE, DRONE, LATITUDE, LONGITUDE, STORE, Robot, Sent, message, unitree
+from e2e.robots import ARM, ARM_JOINTS, BASE, DRONE, LATITUDE, LONGITUDE, STORE, UNITREE_TOPICS, Robot, Sent, message
 from live.browsing import holds
 
 from shadowhound_data_logger.core.type_rules import RULES, is_of_unitree
@@ -144,28 +144,21 @@ def assert_logs_itself_alone(robot: Robot, ledger: Mapping[str, Any]) -> None:
 def test_a_unitree_is_logged_from_its_own_topics(processes: Processes, browser: Browser, tmp_path: Path) -> None:
     """Through Cyclone DDS, without the driver: they serve as the sensors of a Go2, and the battery is known.
 
-    Messages of unitree_go need the package; without it the log explains how to build it, and everything else is stored.
+    With or without the package ``unitree_go``.
     """
-    has_package = find_spec('unitree_go') is not None
-    robot = Robot(processes, unitree(has_package=has_package), robot='go2', mission='go2', cyclone=True)
+    robot = Robot(processes, UNITREE_TOPICS, robot='go2', mission='go2', cyclone=True)
     with robot.walking():
         page = robot.shown(
             browser, 'Camera', '3D view', 'Path', 'Attitude', 'Acceleration', 'Joints', 'Battery', 'Temperature', 'Log',
-            drawn=('cloud', 'odom', 'imu', *(('battery',) if has_package else ())),
+            drawn=('cloud', 'odom', 'imu', 'battery'),
         )  # fmt: skip
-        if not has_package:
-            why = page.locator('[data-why=battery]').first
-            until(lambda: 'its message package is not installed here' in why.inner_text(), 'why no battery is drawn')
         page.close()
     robot.finish()
     robot.fetched(tmp_path / 'data')
     rows = robot.ask('query', '--robot', 'go2')
     assert {row['sensor'] for row in rows} >= {each.sensor for each in robot.topics.values() if each.sensor}
-    if has_package:
-        assert 77.0 in {row['battery_pct'] for row in rows if row['sensor'] == 'lidar'}
-    else:
-        assert '/lowstate is not logged: its message package is not installed here' in robot.node.log
-        assert 'colcon build --base-paths interfaces/unitree_go' in robot.node.log
+    assert 77.0 in {row['battery_pct'] for row in rows if row['sensor'] == 'lidar'}
+    assert 'is not logged' not in robot.node.log
     refused = robot.refused('export', 'lerobot', 'walks', '--to', str(tmp_path / 'walks'), '--mission-type', 'walk')
     assert 'has no data of camera in it; a LeRobot dataset needs images' in refused, refused
 

@@ -13,7 +13,7 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.ros.endpoints import HistoryDepth, alternatives, plans
-from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
+from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, installed_class
 
 
 class EarlyReaders:
@@ -30,6 +30,7 @@ class EarlyReaders:
             if sensor.enabled and sensor.types and len(alternatives(sensor.types[0])) == 1 and sensor.types[0]:
                 topic, name = node.resolve_topic_name(sensor.topics[0]), sensor.types[0]
                 try:
+                    installed_class(name)  # to make another one takes half a second, in which the others would miss messages
                     for plan in plans(topic, name, (), HistoryDepth(name).depth):
                         reader = Reader(node, plan, self.group)
                         reader.drained_s = time.monotonic()

@@ -35,7 +35,9 @@ from shadowhound_data_logger.ros.reader import (
     SubscriptionRefused,
     endpoints,
     install_hint,
+    is_installed,
     node_of,
+    other_definition,
     unavailable,
 )
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -266,7 +268,11 @@ class Subscriber:
             self.has_latched = any(publisher.transient_local for publisher in publishers)
         self._senders.poll([publisher.gid for publisher in publishers], now_s)
         self._account_for_others(type_name, found, now_s)
-        if not type_name or not self._is_available(type_name, is_published=bool(publishers)):
+        if not type_name:
+            return
+        if not self._is_available(type_name, is_published=bool(publishers)):
+            if self._unavailable and self._readers:
+                self.close(now_s)
             return
         if type_name != self._type:
             self._retype(type_name, now_s)
@@ -369,13 +375,18 @@ class Subscriber:
     def _is_available(self, type_name: str, *, is_published: bool) -> bool:
         """Whether messages of the type can be received here; checked before anything is started or counted for them.
 
-        While the type is not published, an unavailable type is no problem: the default settings name types of other robots.
+        While the type is not published, an unavailable type is no problem: the default settings name types of other robots. One
+        whose package is not installed is subscribed to once it is published: until then its definition cannot be compared.
         """
+        if not is_published and not is_installed(type_name):
+            self._unavailable = ''
+            return bool(self._readers)
         why = unavailable(type_name)
-        self._unavailable = why if is_published else ''
+        hint = install_hint(type_name) if why else ''
+        self._unavailable = why or other_definition(self._node, self._chosen, type_name)
         if self._unavailable:
-            self._log_once(type_name, f'{self._chosen} is not logged: {why}{install_hint(type_name)}')
-        return not why
+            self._log_once(type_name, f'{self._chosen} is not logged: {self._unavailable}{hint}')
+        return not self._unavailable
 
     def _retype(self, type_name: str, now_s: float) -> None:
         """Start with a topic that is new, or has another type than before."""
