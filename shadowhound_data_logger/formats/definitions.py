@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 
 VENDORED: Final = Path(__file__).with_name('interfaces')
 """Message packages as in ``share/``: go2_interfaces, unitree_go and unitree_hg."""
+LEARNED: Final[dict[str, str]] = {}
+"""Definitions that publishers gave to this process. Read by any thread, changed by ``learn``."""
 SEPARATOR: Final = '=' * 80
 _TYPE: Final = re.compile(r'([A-Za-z0-9_]+)/(?:(msg|srv|action)/)?([A-Za-z0-9_]+)', re.ASCII)
 _MSG_FIELD: Final = re.compile(r'(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+')
@@ -74,7 +76,13 @@ def read_definition(prefixes: Iterable[str | Path], type_name: str, extension: s
     package, kind, name, part = _split_name(type_name)
     if kind != 'msg' and extension == 'msg':
         raise FileNotFoundError(f'{type_name} is part of a service or an action')
-    text = _find_file(prefixes, type_name, extension).read_text(encoding='utf-8', errors='replace')
+    try:
+        text = _find_file(prefixes, type_name, extension).read_text(encoding='utf-8', errors='replace')
+    except FileNotFoundError:
+        learned = LEARNED.get(f'{package}/{kind}/{name}')
+        if extension != 'msg' or learned is None:
+            raise
+        return learned
     derived = _DERIVED[kind]
     if part not in derived:
         return text
@@ -88,6 +96,14 @@ def read_definition(prefixes: Iterable[str | Path], type_name: str, extension: s
         structs.append(f'    struct {name}_{each} {{\n{fields}    }};\n')
     head = ''.join(f'#include "{of}.idl"\n' for of in dict.fromkeys(includes))
     return f'{head}{text}\nmodule {package} {{\n  module {kind} {{\n{"".join(structs)}  }};\n}};\n'
+
+
+def learn(texts: Mapping[str, str]) -> None:
+    """Add the texts of ``.msg`` files by type name, for types that have no definition here."""
+    for type_name, text in texts.items():
+        if not describe(type_name)[1]:
+            LEARNED[type_name] = text
+    _describe.cache_clear()
 
 
 def _split_name(type_name: str) -> tuple[str, str, str, str]:

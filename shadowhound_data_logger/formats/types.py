@@ -22,7 +22,7 @@ from rosbags.typesys.store import Typestore
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.formats.cdr import ENCAPSULATION_BYTES, read_message
-from shadowhound_data_logger.formats.definitions import read_definition, without_includes
+from shadowhound_data_logger.formats.definitions import LEARNED, read_definition, without_includes
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
@@ -183,7 +183,7 @@ class MessageTypes:
 
     def _load(self, type_name: str) -> Fielddefs:
         with self._lock:
-            if type_name in self._unknown:
+            if type_name in self._unknown and type_name not in LEARNED:
                 raise Rejected('unknown_type', self._unknown[type_name])
             try:
                 definitions: Typesdict = {}

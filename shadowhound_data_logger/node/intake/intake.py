@@ -27,6 +27,7 @@ from shadowhound_data_logger.node.intake.found_topics import FoundTopics
 from shadowhound_data_logger.node.intake.subscriber import Dependencies, OtherTypes, Subscriber, SubscriberStatus
 from shadowhound_data_logger.ros.endpoints import POLL_S, alternatives
 from shadowhound_data_logger.ros.reader import PolledGroup
+from shadowhound_data_logger.ros.type_descriptions import TypeDescriptions
 from shadowhound_data_logger.spool.accounts import Accounts
 
 REFRESH_S: Final = 0.5
@@ -56,7 +57,9 @@ class Intake:
         self.consumers = consumers
         self.found = found
         self._early = early
-        self._context = context = Dependencies(node, early.group if early else PolledGroup(), accounts, types, stamps, early)
+        group = early.group if early else PolledGroup()
+        self._descriptions = TypeDescriptions(node, group)
+        self._context = context = Dependencies(node, group, accounts, types, stamps, early, self._descriptions)
         self._others = OtherTypes(node, accounts)
         self._subscribers = tuple(Subscriber(context, sensor, consumers, self._others) for sensor in sensors.values())
         self._is_first = first
@@ -221,7 +224,15 @@ class Intake:
         now_s = time.monotonic()
         ends = [partial(subscriber.close, now_s) for subscriber in self._subscribers]
         ends += [partial(extra.end, now_s) for extra in self._extra]
-        _each([*ends, *(consumer.flush for consumer in self.consumers), self._others.close, self.worker.stop])
+        _each(
+            [
+                *ends,
+                *(consumer.flush for consumer in self.consumers),
+                self._others.close,
+                self._descriptions.close,
+                self.worker.stop,
+            ]
+        )
 
 
 class _Requests:

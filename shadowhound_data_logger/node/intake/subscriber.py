@@ -40,6 +40,7 @@ from shadowhound_data_logger.ros.reader import (
     other_definition,
     unavailable,
 )
+from shadowhound_data_logger.ros.type_descriptions import TypeDescriptions
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.topic_account import MAX_NODES, MAX_OTHER_TYPES, SINKS, WRONG_TYPE
 
@@ -189,6 +190,8 @@ class Dependencies(NamedTuple):
     stamps: StampRule
     early: EarlyReaders | None = None
     """Subscriptions that exist already."""
+    descriptions: TypeDescriptions | None = None
+    """Where definitions of unknown types are requested."""
 
 
 class Subscriber:
@@ -203,7 +206,7 @@ class Subscriber:
         """
         self.sensor = sensor
         self._others = others
-        self._node, self._group, self._accounts, self._message_types, self._stamps, self._early = shared
+        self._node, self._group, self._accounts, self._message_types, self._stamps, self._early, self._descriptions = shared
         self._consumers = consumers
         node = self._node
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
@@ -270,7 +273,7 @@ class Subscriber:
         self._account_for_others(type_name, found, now_s)
         if not type_name:
             return
-        if not self._is_available(type_name, is_published=bool(publishers)):
+        if not self._is_available(type_name, now_s, is_published=bool(publishers)):
             if self._unavailable and self._readers:
                 self.close(now_s)
             return
@@ -372,7 +375,7 @@ class Subscriber:
             return False
         return True
 
-    def _is_available(self, type_name: str, *, is_published: bool) -> bool:
+    def _is_available(self, type_name: str, now_s: float, *, is_published: bool) -> bool:
         """Whether messages of the type can be received here; checked before anything is started or counted for them.
 
         While the type is not published, an unavailable type is no problem: the default settings name types of other robots. One
@@ -382,6 +385,9 @@ class Subscriber:
             self._unavailable = ''
             return bool(self._readers)
         why = unavailable(type_name)
+        if why and self._descriptions is not None and self._descriptions.poll(self._chosen, type_name, now_s):
+            self._unavailable = ''
+            return False
         hint = install_hint(type_name) if why else ''
         self._unavailable = why or other_definition(self._node, self._chosen, type_name)
         if self._unavailable:

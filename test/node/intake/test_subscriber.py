@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import pytest
@@ -193,6 +194,31 @@ def test_an_uninstalled_type_is_reported(make: Callable[[str], Any], monkeypatch
     assert (totals.accounting == EXACT, totals.missed, totals.rejected) == (NUMBERED, 0 if NUMBERED else None, 0)
     assert totals.other_types == {STRING: OtherType(('/squatter',), None)}
     assert not squatter.matched()
+
+
+def test_a_type_is_not_reported_while_its_definition_is_requested(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch,
+                                                                  caplog: pytest.LogCaptureFixture) -> None:  # fmt: skip
+    """Its publisher may answer; once it did the topic is received, and nothing was logged about its package."""
+    real, known = module.unavailable, set[str]()
+    monkeypatch.setattr(module, 'unavailable', lambda name: real(name) if name in known else 'not here')
+    monkeypatch.setattr(module, 'is_installed', lambda _: False)
+    logger, robot = make('logger'), make('robot')
+    robot.create(Int32, '/odom')
+    logger.listen('/odom', INT)
+    answers = iter([True, True])
+    asked: list[str] = []
+
+    def poll(topic: str, type_name: str, now_s: float) -> bool:
+        asked.append(f'{topic} {type_name}')
+        if not next(answers, False):
+            known.add(INT)
+        return True
+
+    logger.source._descriptions = SimpleNamespace(poll=poll)
+    logger.until(robot.matched, 'it is subscribed to')
+    assert set(asked) == {f'/odom {INT}'}
+    assert 'is not logged' not in caplog.text
+    assert not logger.source.status().unavailable
 
 
 def test_a_third_type_is_not_counted(make: Callable[[str], Any]) -> None:
