@@ -21,7 +21,8 @@ ORDER = ('core', 'stores', 'formats', 'policies', 'ros', 'spool', 'shipping', 'm
          'datasets', 'live', 'doctor', 'cli')  # fmt: skip
 """Each folder may import those before it. The face is the package itself."""
 ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfaces', 'nav_msgs', 'rcl_interfaces', 'rclpy',
-       'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs', 'type_description_interfaces'}  # fmt: skip
+       'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs',
+       'type_description_interfaces'}  # fmt: skip
 ALLOWED = {
     **{name: {'node', 'ros'} for name in ROS},
     'rclpy': {'node', 'doctor', 'live', 'ros'},
