@@ -11,7 +11,6 @@ import click
 from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.audit import verify_delivered
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     duration,
@@ -99,6 +98,8 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
     if topic or since or until or cause:
         raise BadUsage('--topic, --since, --until and --cause choose among gaps', 'add --gaps')
     if ask or deep:
+        from shadowhound_data_logger.cli.audit import verify_delivered  # noqa: PLC0415 - needs a tenth of a second to load
+
         return verify_delivered(folder, deep=deep, again=again, as_json=as_json)
     if again:
         raise BadUsage('--again is for --verify and --deep', 'add --verify')

@@ -18,7 +18,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -78,6 +77,8 @@ def run_smoke(folder: Path, manifest: PolicyManifest, isolation: str = SANDBOX, 
     PolicyError if onnxruntime is not installed, or if a sandbox is required but not available.
     """
     folder = folder.absolute()
+    import tempfile  # noqa: PLC0415 - `status` imports this module
+
     with tempfile.TemporaryDirectory(prefix='shadowhound-policy-') as empty:
         sandbox, problem = open_sandbox(folder, empty)
         if problem and isolation != LIMITS:
