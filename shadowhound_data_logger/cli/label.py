@@ -135,7 +135,7 @@ def label_import(*, file: Any, robot: str | None, user: str | None, as_json: boo
 @click.option('--label', 'name', metavar='NAME', help='Only with this label.')
 @as_json
 def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCode:
-    """Show the present labels."""
+    """List the labels."""
     with asking():
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
@@ -173,7 +173,7 @@ _COLUMNS: Final = ('id', 'robot', 'label', 'from (UTC)', 'to (UTC)', 'object', '
 def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, user: str | None, as_json: bool) -> ExitCode:
     """Remove labels by id, or all with a name.
 
-    A layer records the removal; what was labeled before stays in the store. Exit code 1 if some of the ids do not exist.
+    The removal is recorded; what was labeled stays in the store. Exit code 1 if some of the ids do not exist.
     """
     if bool(ids) == bool(name):
         raise BadUsage('give either ids or --label', 'shadowhound-data label list')

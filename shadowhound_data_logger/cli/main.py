@@ -78,9 +78,9 @@ class Verbs(click.Group):
 )
 @click.version_option(package_name='shadowhound_data_logger', prog_name=PROGRAM)
 def cli() -> None:
-    """See, find and move the data of a robot, in its spool and in the store.
+    """Inspect, find and move the data of a robot, in its spool and in the store.
 
-    SHADOWHOUND_HOME is the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: the one whose
+    SHADOWHOUND_HOME contains the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT names the robot (default: the one whose
     node ran here), AWS_ENDPOINT_URL the S3 server (default: the folder SHADOWHOUND_HOME/store). Most verbs print JSON with
     --json.
     """

@@ -208,7 +208,7 @@ def pin(*, as_json: bool) -> ExitCode:
 @click.command(epilog=examples('policy unpin'))
 @as_json
 def unpin(*, as_json: bool) -> ExitCode:
-    """Follow the registry again."""
+    """Follow the registry again after policy pin or use."""
     _policies().unpin()
     print_json({'pinned': None}) if as_json else click.echo('follows the registry again')
     return ExitCode.FINE

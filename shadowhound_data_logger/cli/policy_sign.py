@@ -73,8 +73,8 @@ def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encry
          ) -> ExitCode:  # fmt: skip
     """Make the keys that sign policies.
 
-    A team of one gets root.key, to be kept offline, targets.key, which signs versions, online.key, which dates them, and
-    root.json for robots. With --root-key, several people hold the root: each signs root.json with policy sign-root.
+    For one person it makes root.key (keep it offline), targets.key (signs versions), online.key (renews their dates) and
+    root.json (for robots). With --root-key, several people hold the root: each signs root.json with policy sign-root.
     """
     place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
     files, roots, _ = _signers()
@@ -131,8 +131,8 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
            folder: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Replace keys that may have been stolen.
 
-    By default it replaces targets.key and online.key. Robots learn of it from the store. What others signed with the old keys
-    is no longer listed.
+    By default it replaces targets.key and online.key. Robots get the new ones from the store. Versions that others signed
+    with the old keys are no longer listed.
     """
     if (publics or threshold) and 'root' not in roles:
         raise BadUsage('--root-key and --threshold are of a new root', 'policy rotate root --root-key alice.pub')
@@ -189,7 +189,7 @@ def delegate(*, who: str, paths: tuple[str, ...], revoke: bool, key: Path | None
 @_signs
 @as_json
 def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
-    """Renew the signed timestamp, once a day.
+    """Renew the signed timestamp; run it daily.
 
     It needs online.key and runs from cron. It includes what other signers have published, and activates a root once it has
     all its signatures.

@@ -100,7 +100,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
 
     An object must match all flags; times are UTC.
 
-    SQL has the views objects, missions, topics, gaps and watermarks, restricted by the flags.
+    SQL has the views objects, missions, topics, gaps, watermarks, labels and forgotten, restricted by the flags.
 
     --when 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60' tests the values in the objects: the answer is times,
     which --ranges accepts. A plain name tests each message; first last min max mean count nan_count test each object.
