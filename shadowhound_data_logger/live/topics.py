@@ -34,8 +34,17 @@ from shadowhound_data_logger.live.trees import numbers, parsed, tree
 from shadowhound_data_logger.live.viewers import Graph
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile
-from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
+from shadowhound_data_logger.ros.reader import (
+    MAX_TAKES,
+    PolledGroup,
+    Reader,
+    SubscriptionRefused,
+    TypeUnavailable,
+    endpoints,
+    unavailable,
+)
 from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
+from shadowhound_data_logger.ros.type_descriptions import TypeDescriptions
 
 log = logging.getLogger(__name__)
 
@@ -153,6 +162,7 @@ class Topics:
         self._types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         self._node: Node | None = None
         self._sampler: Sampler | None = None
+        self._descriptions: TypeDescriptions | None = None
         self._guard: PortGuard | None = None
         self._graph: Graph = {}
         self._total = self._counted = 0
@@ -172,6 +182,7 @@ class Topics:
         with without_our_profile(os.environ), dead_ports_avoided(get_default_context().get_domain_id()):
             self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
         self._sampler = Sampler(self._node, self._on_items)
+        self._descriptions = TypeDescriptions(self._node, PolledGroup())
         self._guard = PortGuard()
         self.worker.start()
 
@@ -188,6 +199,8 @@ class Topics:
             one.reader.close()
         if self._sampler is not None:
             self._sampler.close()
+        if self._descriptions is not None:
+            self._descriptions.close()
         if self._node is not None:
             self._node.destroy_node()
         rclpy.try_shutdown()
@@ -249,6 +262,7 @@ class Topics:
     def _follow(self, wanted: _Wanted) -> None:
         assert self._node is not None
         assert self._sampler is not None
+        assert self._descriptions is not None
         sampled = (key.removesuffix(_SAMPLED) for key in wanted if key.endswith(_SAMPLED))
         self._sampler.follow({topic: self._graph[topic][0] for topic in sampled if topic in self._graph})
         topics: dict[str, set[str]] = {}
@@ -268,6 +282,8 @@ class Topics:
                 try:
                     self._watched[topic] = _Watched(self._node, topic, type_name, keys)
                 except (TypeUnavailable, SubscriptionRefused, Rejected) as error:
+                    if unavailable(type_name) and self._descriptions.poll(topic, type_name, time.monotonic()):
+                        continue  # its publisher may answer until the next check of the graph
                     self._refused[topic] = type_name, keys
                     log.warning('%s is not shown: %s', topic, error)
                     self._on_items([item for key in sorted(keys) for item in self._problem(key, str(error))])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -15,6 +16,7 @@ import pytest
 from domains import free_domain
 from e2e.live_frames import Frames
 from live.test_kinds import image
+from ros.unknown_type import hidden, publisher
 
 from shadowhound_data_logger.live import kinds
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
@@ -380,3 +382,18 @@ def test_why_a_topic_cannot_be_sampled_is_reported(tmp_path: Path, monkeypatch: 
             assert tab.samples[IMU]['hz'] > 5
 
     run(tmp_path, monkeypatch, doing)
+
+
+def test_a_message_of_an_unknown_type_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its publisher is asked for the definition."""
+
+    async def doing(found: Robot) -> None:
+        with publisher(int(os.environ['ROS_DOMAIN_ID'])):
+            async with found.tab() as tab:
+                await until(lambda: '/arrays' in tab.topics, 'the topic is found')
+                await tab.watch('/arrays#')
+                await until(lambda: '/arrays#' in tab.heads, 'its message is shown')
+                assert 'alignment_check' in str(tab.heads['/arrays#'])
+
+    with hidden(monkeypatch):
+        run(tmp_path, monkeypatch, doing)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from random import Random
 from types import SimpleNamespace
 from typing import Any
@@ -14,26 +12,15 @@ from typing import Any
 import pytest
 from e2e.processes import until
 from node.participants import Participant
+from ros.unknown_type import NAME, hidden, publisher
 
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.formats import definitions
 from shadowhound_data_logger.formats.types import MessageTypes
-from shadowhound_data_logger.ros import reader, type_support
+from shadowhound_data_logger.ros import type_support
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, unavailable
 from shadowhound_data_logger.ros.type_descriptions import MAX_ARRAY, PATIENCE_S, TypeDescriptions, parse
-
-NAME = 'test_msgs/msg/Arrays'
-PROGRAM = """
-import sys, rclpy
-from rclpy.qos import QoSProfile
-from test_msgs.msg import Arrays
-rclpy.init()
-node = rclpy.create_node('knowing', namespace='/robot')
-publisher = node.create_publisher(Arrays, '/arrays', QoSProfile(depth=10))
-node.create_timer(0.1, lambda: publisher.publish(Arrays(alignment_check=7)))
-rclpy.spin(node)
-"""
 
 
 def content(name: str) -> tuple[Any, str]:
@@ -115,31 +102,6 @@ def test_what_a_hostile_node_announces_is_bounded(monkeypatch: pytest.MonkeyPatc
     assert 0 < accepted < 1900
 
 
-@pytest.fixture
-def hidden(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """This machine has neither the package test_msgs nor its definitions."""
-    pytest.importorskip('test_msgs')
-    find, is_installed = definitions._find_file, reader._is_installed
-
-    def find_others(prefixes: Any, type_name: str, extension: str) -> Any:
-        if type_name.startswith('test_msgs/'):
-            raise FileNotFoundError(type_name)
-        return find(prefixes, type_name, extension)
-
-    def forget() -> None:
-        definitions._describe.cache_clear()
-        definitions.LEARNED.clear()
-        for known in (reader.message_class, reader.is_installed, reader.unavailable, type_support._maker):
-            known.cache_clear()
-        type_support._CLASSES.clear()
-
-    monkeypatch.setattr(definitions, '_find_file', find_others)
-    monkeypatch.setattr(reader, '_is_installed', lambda package, kind: package != 'test_msgs' and is_installed(package, kind))
-    forget()
-    yield
-    forget()
-
-
 @pytest.mark.ros
 @pytest.mark.parametrize('name', ['no such', '1', 'x' * 300, 'absent'])
 def test_a_node_that_cannot_be_asked_is_asked_once(name: str, domain: int) -> None:
@@ -162,13 +124,13 @@ def test_a_node_that_cannot_be_asked_is_asked_once(name: str, domain: int) -> No
 
 
 @pytest.mark.ros
-@pytest.mark.usefixtures('hidden')
-def test_an_unknown_type_is_received(domain: int) -> None:
+def test_an_unknown_type_is_received(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its publisher is asked, the answer is verified, and its messages are received and decoded."""
-    if type_support.rclpy_version()[0] < type_support.FIRST_WITH_HASH:
-        pytest.skip('types have no descriptions')
-    environ = {**os.environ, 'ROS_DOMAIN_ID': str(domain)}
-    publisher = subprocess.Popen([sys.executable, '-c', PROGRAM], env=environ)
+    with hidden(monkeypatch), publisher(domain):
+        receive(domain)
+
+
+def receive(domain: int) -> None:
     logger = Participant('asking', domain)
     asking = TypeDescriptions(logger.node, PolledGroup())
     types = MessageTypes(os.environ['AMENT_PREFIX_PATH'].split(':'))
@@ -183,6 +145,4 @@ def test_an_unknown_type_is_received(domain: int) -> None:
         reader_.close()
     finally:
         asking.close()
-        publisher.kill()
-        publisher.wait()
         logger.end()
