@@ -1,4 +1,4 @@
-"""ROS domains for tests: each is used by one test at a time on this machine."""
+"""ROS domains for tests; one test at a time uses a domain on this machine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shadowhound_data_logger.ros.shared_memory import orphans
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """A ROS domain that nobody uses, and no other run of these tests takes meanwhile."""
+    """An unused ROS domain, locked against other runs of these tests."""
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         lock = os.open(Path(tempfile.gettempdir()) / f'shadowhound-test-domain-{domain}.lock', os.O_RDWR | os.O_CREAT, 0o666)
         try:

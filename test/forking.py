@@ -1,8 +1,8 @@
-"""Python programs that are forked from a process in which what they import is there already.
+"""Python programs that are forked from a process with their imports already loaded.
 
-To import rclpy and the package costs a program more CPU time than most tests with it; few tests are about its start. A
-forked program has the environment, arguments and files that it was given, is told of signals, and ends as an interpreter
-does. What has to be set before an interpreter is there, or before the RMW is loaded, needs a process of its own.
+Importing rclpy and the package takes a program more CPU time than most tests of it, and few tests are about its startup. A
+forked program has its own environment, arguments and files, receives signals, and exits as an interpreter
+does. Variables that an interpreter or the RMW reads when it is loaded need a separate process.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ class Forked:
                 selector.register(self._status, selectors.EVENT_READ)
                 if not selector.select(timeout):
                     return None
-            told = os.read(self._status, 100)
+            status = os.read(self._status, 100)
             os.close(self._status)
-            self.returncode = int(told or -signal.SIGKILL)  # nothing is told when the server was killed with it
+            self.returncode = int(status or -signal.SIGKILL)  # empty if the server was killed, too
         return self.returncode
 
 
@@ -115,7 +115,7 @@ _servers: list[ForkServer] = []
 
 
 def can_fork(environ: Mapping[str, str]) -> bool:
-    """Whether a program in that environment finds what it would find in a process of its own."""
+    """Whether a program in that environment finds the same as in a separate process."""
     return all(environ.get(name) == os.environ.get(name) for name in OWN_PROCESS) and 'RMW_IMPLEMENTATION' not in environ
 
 
@@ -156,7 +156,7 @@ def import_all() -> None:
 
 
 def serve(orders: socket.socket) -> list[str] | None:
-    """Fork what is ordered. Returns in each child, with its command; in the server, with None, when nobody is there to order."""
+    """Fork as ordered. Returns in each child, with its command; in the server, with None, when its client has exited."""
     selector = selectors.DefaultSelector()
     selector.register(orders, selectors.EVENT_READ)
     children: dict[int, tuple[int, int]] = {}

@@ -1,4 +1,4 @@
-"""The borders of the package: who may import what, and that using its face costs next to nothing."""
+"""The structure of the package: which folder may import what, and that importing the package is fast."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PACKAGE = 'shadowhound_data_logger'
 ROOT = Path(__file__).parents[1] / PACKAGE
 ORDER = ('core', 'stores', 'formats', 'policies', 'ros', 'spool', 'shipping', 'missions', 'face', 'bags', 'node', 'lake',
          'datasets', 'live', 'doctor', 'cli')  # fmt: skip
-"""Each folder may import those before it. The face is the package itself."""
+"""Each folder may import those before it. ``face`` is the package itself."""
 ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfaces', 'nav_msgs', 'rcl_interfaces', 'rclpy',
        'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs',
        'type_description_interfaces'}  # fmt: skip
@@ -74,7 +74,7 @@ def _imports(path: Path) -> Iterator[str]:
 
 
 def folder(path: Path) -> str:
-    """The folder of a module, by its name in the order."""
+    """The folder of a module, as named in ``ORDER``."""
     inside = path.relative_to(ROOT).parts
     if len(inside) > 1:
         return inside[0]
@@ -82,7 +82,7 @@ def folder(path: Path) -> str:
 
 
 PLACES = {path.relative_to(ROOT).with_suffix('').parts[0]: folder(path) for path in MODULES}
-"""What follows the package's name in an import -> the folder that it is of."""
+"""The name after the package's name in an import -> its folder."""
 
 
 def folders(path: Path) -> Iterator[str]:
@@ -94,13 +94,13 @@ def folders(path: Path) -> Iterator[str]:
 
 
 def test_every_folder_has_its_position() -> None:
-    """The order names every folder, and none that is gone."""
+    """ORDER contains exactly the existing folders."""
     assert sorted(ORDER) == sorted(set(PLACES.values()))
 
 
 @pytest.mark.parametrize('name', ORDER)
 def test_a_folder_imports_only_those_before_it(name: str) -> None:
-    """The folders have one order, and no import goes against it."""
+    """No folder imports a later one."""
     later = ORDER[ORDER.index(name) + 1 :]
     ours = [path for path in MODULES if folder(path) == name]
     assert [f'{path.relative_to(ROOT)}: {found}' for path in ours for found in folders(path) if found in later] == []
@@ -108,25 +108,25 @@ def test_a_folder_imports_only_those_before_it(name: str) -> None:
 
 @pytest.mark.parametrize('package', sorted(ALLOWED))
 def test_imports_are_those_that_are_allowed(package: str) -> None:
-    """ROS, S3, MLflow and Arrow are known to their own folders alone."""
+    """ROS, S3, MLflow and Arrow are imported by certain folders only."""
     importers = {folder(path) for path in MODULES if any(name.partition('.')[0] == package for name in imports(path))}
     assert importers <= ALLOWED[package]
 
 
 def test_one_file_imports_mlflow() -> None:
-    """Of the missions, tracking.py alone imports it, and none of its importing happens where an agent logs."""
+    """In missions/ only tracking.py imports it, which the agent's process does not load."""
     ours = [path for path in MODULES if folder(path) == 'missions']
     assert [path.name for path in ours if any(name.startswith('mlflow') for name in imports(path))] == ['tracking.py']
 
 
 def test_one_file_of_the_stores_imports_obstore() -> None:
-    """It comes with the extra ``lake``: a robot has none."""
+    """It comes with the extra ``lake``, which robots do not install."""
     ours = [path for path in MODULES if folder(path) == 'stores']
     assert [path.name for path in ours if any(name.startswith('obstore') for name in imports(path))] == ['s3_obstore.py']
 
 
 def test_only_the_tables_of_the_spools_index_send_sql_to_it() -> None:
-    """Other modules that send SQL have their own database: what was fetched, a bag, the lake's tables."""
+    """Other modules that send SQL have their own database: fetched objects, a bag, the lake's tables."""
     tables = {path.relative_to(ROOT).as_posix() for path in ROOT.glob('spool/*_table.py')}
     index = {'spool/index.py', 'spool/schema.py', *tables}
     own = {
@@ -142,9 +142,9 @@ def test_only_the_tables_of_the_spools_index_send_sql_to_it() -> None:
 
 
 def test_the_live_page_does_not_import_the_node() -> None:
-    """It reads topics through ros/ and what is stored through spool/; two files of it know ROS, and are loaded where ROS is."""
+    """It reads topics through ros/ and stored data through spool/; two files import rclpy."""
     ours = [path for path in MODULES if folder(path) == 'live']
-    reads_the_past = {'past.py', 'history.py', 'kept.py', 'fleet.py'}  # in a process of their own
+    reads_the_past = {'past.py', 'history.py', 'kept.py', 'fleet.py'}  # in a separate process
     assert {name for path in ours if path.name not in reads_the_past for name in folders(path)} <= {
         'core', 'formats', 'live', 'policies', 'ros', 'spool',
     }  # fmt: skip
@@ -153,13 +153,13 @@ def test_the_live_page_does_not_import_the_node() -> None:
 
 
 def test_one_file_of_the_doctor_imports_ros() -> None:
-    """It is loaded in a process of its own, which may crash; the rest of the doctor works on machines without ROS."""
+    """It runs in a separate process, which may crash; the rest of the doctor works without ROS."""
     ours = [path for path in MODULES if folder(path) == 'doctor']
     assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['ros_watch.py']
 
 
 def test_a_robot_writes_the_catalog_without_reading_it() -> None:
-    """What the node runs imports none of the packages that only the extra ``lake`` brings."""
+    """The node imports none of the packages that are only in the extra ``lake``."""
     program = f"""
 import sys
 from {PACKAGE}.shipping import catalog_writer
@@ -170,7 +170,7 @@ print([name for name in ('deltalake', 'obstore', 'pyarrow') if name in sys.modul
 
 
 def test_metadata_keys_are_documented() -> None:
-    """Each word is defined once, and the page on formats says what it means."""
+    """Each key is defined once, and docs/formats.md explains it."""
     words = {name: word for name, word in vars(metadata_keys).items() if name.isupper()}
     page = (ROOT.parent / 'docs' / 'formats.md').read_text(encoding='utf-8')
     assert len(set(words.values())) == len(words)
@@ -178,7 +178,7 @@ def test_metadata_keys_are_documented() -> None:
 
 
 def test_the_page_on_architecture_names_existing_files() -> None:
-    """Who looks for the place of a change there finds it."""
+    """Each module that docs/architecture.md names exists."""
     page = (ROOT.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
     named = set(re.findall(r'`([\w/]+\.py)\b', page)) - {'bench/code.py', 'test/test_borders.py'}
     there = {path.relative_to(ROOT).as_posix() for path in MODULES} | {path.name for path in MODULES}
@@ -187,7 +187,7 @@ def test_the_page_on_architecture_names_existing_files() -> None:
 
 
 def test_the_glossary_names_existing_terms() -> None:
-    """Each of its terms is in the code or on another page, stands there once, and in order."""
+    """Each term is used in the code or on another page; terms are unique and sorted."""
     page = (ROOT.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
     terms = re.findall(r'^- \*\*(.+?)\*\*', page.partition('## Glossary')[2].partition('\n## ')[0], re.MULTILINE)
     assert len(terms) > 20
@@ -207,7 +207,7 @@ LIGHT = frozenset({PACKAGE, '__main__', 'orjson'})
 
 
 def test_the_public_face_is_light() -> None:
-    """``from shadowhound_data_logger import *`` loads 60 modules of ours at most, and of others orjson alone."""
+    """``from shadowhound_data_logger import *`` loads fewer than 60 of our modules, and of others only orjson."""
     plain = subprocess.run(
         [sys.executable, '-c', PROGRAM.replace(f'from {PACKAGE} import *', '')], capture_output=True, check=True
     )
@@ -219,7 +219,7 @@ def test_the_public_face_is_light() -> None:
 
 
 def test_public_names_are_documented() -> None:
-    """``__all__`` is explicit, and every name in it is there."""
+    """``__all__`` is explicit, and every name in it exists."""
     module = __import__(PACKAGE)
     assert isinstance(module.__all__, list)
     assert all(hasattr(module, name) for name in module.__all__)

@@ -62,7 +62,7 @@ def prose(path: Path) -> Iterator[tuple[int, str]]:
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_module_has_none_of_these_idioms(path: Path) -> None:
-    """The list is the mechanical part of plain English: a sentence that passes may still deserve rewriting."""
+    """The mechanical part of plain English: a sentence that passes may still deserve rewriting."""
     found = [
         f'line {line + text[: match.start()].count(chr(10))}: {match[0]!r}: write {instead}'
         for line, text in prose(path)

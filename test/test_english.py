@@ -56,7 +56,7 @@ IDIOMS = {
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_a_page_has_none_of_these_idioms(page: Path) -> None:
-    """Code and the targets of links do not count; Nobody publishes is a line of ``status``."""
+    """Except in code and link targets; ``Nobody publishes`` is a line of ``status``."""
     text = page.read_text(encoding='utf-8')
     for code in (r'(?s)^```.*?^```', r'^(    |\t).*$', r'`[^`\n]*`', r'\]\([^)]*\)'):
         text = re.sub(code, lambda found: '\n' * found[0].count('\n'), text, flags=re.MULTILINE)

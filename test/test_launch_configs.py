@@ -1,6 +1,6 @@
-"""The parameter files: one spells out exactly the defaults of the code, the other stores everything.
+"""The parameter files: one contains exactly the defaults of the code, another stores everything.
 
-The systemd units: what they start exists, and when they start it again.
+The systemd units: what they start, and when they restart it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FOLDER = Path(__file__).parents[1] / 'launch_configs'
 
 
 def flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Dotted names, as ROS makes them of a parameter file."""
+    """A parameter file's tree with dotted names, as in ROS."""
     found: dict[str, Any] = {}
     for name, value in tree.items():
         found |= flat(value, f'{prefix}{name}.') if isinstance(value, dict) else {f'{prefix}{name}': value}
@@ -38,7 +38,7 @@ def parameters(path: Path) -> dict[str, Any]:
 
 
 def test_go2_yaml_is_the_defaults() -> None:
-    """Each parameter stands there with its default in its own type, and no other parameter."""
+    """It contains each parameter with its default, in the right type, and no others."""
     given, defaults = parameters(FOLDER / 'go2.yaml'), default_parameters()
     assert given == defaults
     assert {name: type(value) for name, value in given.items()} == {name: type(value) for name, value in defaults.items()}
@@ -51,7 +51,7 @@ def test_every_parameter_file_is_valid(path: Path) -> None:
 
 
 def test_generic_yaml_logs_every_topic_by_its_type() -> None:
-    """Its comments name the rules as they are, and its examples are settings that the node takes."""
+    """Its comments name the current rules, and its examples are valid settings."""
     text = (FOLDER / 'generic.yaml').read_text(encoding='utf-8')
     assert parameters(FOLDER / 'generic.yaml') == {'robot': '', 'capture.topics': 'all'}
     table = text.partition('names:\n')[2].partition('# docs/parameters')[0]
@@ -68,7 +68,7 @@ def test_generic_yaml_logs_every_topic_by_its_type() -> None:
 
 
 def test_the_full_rate_keeps_every_message() -> None:
-    """With go2_full_rate.yaml every sensor of go2.yaml is logged, none leaves a message out, an object holds a second."""
+    """With go2_full_rate.yaml every sensor of go2.yaml stores every message, in objects of one second."""
     settings = Settings.load(parameters(FOLDER / 'go2_full_rate.yaml'), {})
     assert [sensor.name for sensor in settings.sensors] == parameters(FOLDER / 'go2.yaml')['sensors']
     for sensor in settings.sensors:
@@ -77,8 +77,8 @@ def test_the_full_rate_keeps_every_message() -> None:
         assert isinstance(rule_for(sensor, has_header=True, last_stored_ns=0), EveryMessage), sensor.name
 
 
-def test_the_full_rate_says_only_what_differs() -> None:
-    """Each line of go2_full_rate.yaml changes a default: what it does not change is read in go2.yaml."""
+def test_the_full_rate_has_only_changed_parameters() -> None:
+    """Each line of go2_full_rate.yaml changes a default."""
     defaults = default_parameters()
     same = [name for name, value in parameters(FOLDER / 'go2_full_rate.yaml').items() if defaults[name] == value]
     assert same == []
@@ -88,7 +88,7 @@ ROOT = Path(__file__).resolve().parents[1]
 UNITS = sorted((ROOT / 'launch_configs').glob('*.service'))
 UNIT, LIVE = (ROOT / 'launch_configs' / f'shadowhound-{name}.service' for name in ('data-logger', 'live'))
 CLOSE_S = 5.0
-"""What node/pipeline.py allows for making durable what is in memory."""
+"""How long node/pipeline.py may take to commit what is in memory."""
 
 
 def section(unit: Path) -> dict[str, str]:
@@ -100,7 +100,7 @@ def section(unit: Path) -> dict[str, str]:
 
 
 def script(service: dict[str, str]) -> str:
-    """What the shell is given, which parses and becomes an executable of ours."""
+    """The unit's shell script, after checking that it parses and starts one of our executables."""
     found = re.fullmatch(r"/bin/bash -c '(.*)'", service['ExecStart'])
     assert found
     text = found[1].replace('$$', '$')
@@ -117,7 +117,7 @@ def service() -> dict[str, str]:
 
 
 def test_the_units_start_existing_programs(service: dict[str, str]) -> None:
-    """The shell's script parses; the executable and the files that it names are installed under these names."""
+    """The script parses; the executable and the files that it names are installed."""
     text = script(service)
     named = re.findall(r'\$C/([\w.]+)', text)
     assert named == ['fastdds_shm.xml']
@@ -129,7 +129,7 @@ def test_the_units_start_existing_programs(service: dict[str, str]) -> None:
     ({'SHADOWHOUND_PARAMETERS': '/etc/a robot.yaml'}, ['--ros-args', '--params-file', '/etc/a robot.yaml']),
 ])  # fmt: skip
 def test_the_node_reads_the_file_that_is_set(service: dict[str, str], environ: dict[str, str], arguments: list[str]) -> None:
-    """Without one it has the defaults, which suit any robot."""
+    """Without one the defaults apply."""
     words = script(service).rpartition('/sensor_logger_node"')[2]
     given = {'PATH': os.environ['PATH'], **environ}
     ran = subprocess.run(['bash', '-c', f"printf '%s\\n' {words}"], env=given, capture_output=True, text=True, check=True)
@@ -137,28 +137,28 @@ def test_the_node_reads_the_file_that_is_set(service: dict[str, str], environ: d
 
 
 def test_the_smoke_run_of_policies_can_make_its_sandbox() -> None:
-    """Namespaces are not restricted, and mounts are allowed, in the unit that runs policies for the first time."""
+    """The unit that does smoke runs restricts neither namespaces nor mounts."""
     service = section(UNIT.with_name('shadowhound-policy.service'))
     assert 'RestrictNamespaces' not in service
     assert '@mount' in service['SystemCallFilter'].split()
 
 
 def test_the_smoke_run_of_policies_has_a_place_to_work() -> None:
-    """``ProtectSystem=strict`` leaves nothing to write in but home and /data."""
+    """Because of ``ProtectSystem=strict`` it can otherwise write only to home and /data."""
     text = UNIT.with_name('shadowhound-policy.service').read_text(encoding='utf-8')
     assert 'ProtectSystem=strict' in text
     assert 'PrivateTmp=true' in text
 
 
 def test_refused_settings_are_not_tried_again(service: dict[str, str]) -> None:
-    """A crash starts it again, exit code 2 does not; it has time to close before it is killed."""
+    """It is restarted after a crash but not after exit code 2, and has time to close before it is killed."""
     assert service['Restart'] == 'on-failure'
     assert service['RestartPreventExitStatus'] == '2'
     assert float(service['TimeoutStopSec']) > CLOSE_S + ShutdownSettings().drain_s + 5
 
 
 def test_the_secrets_are_in_the_file_that_the_guide_makes(service: dict[str, str]) -> None:
-    """docs/thor.md creates the file of the unit, for its user alone, and no secret stands in the unit."""
+    """docs/thor.md creates the unit's environment file, readable by its user only, and the unit itself contains no secret."""
     guide = (ROOT / 'docs' / 'thor.md').read_text(encoding='utf-8')
     assert f'install -m 0600 -o {service["User"]} /dev/null {service["EnvironmentFile"]}' in guide
     assert not [name for name in service if name == 'Environment']
@@ -166,11 +166,11 @@ def test_the_secrets_are_in_the_file_that_the_guide_makes(service: dict[str, str
 
 @pytest.mark.parametrize('unit', UNITS, ids=lambda unit: unit.stem)
 def test_systemd_accepts_the_units(unit: Path) -> None:
-    """systemd-analyze finds nothing to complain about."""
+    """``systemd-analyze verify`` reports nothing."""
     if shutil.which('systemd-analyze') is None:
         pytest.skip('no systemd here')
-    said = subprocess.run(['systemd-analyze', 'verify', str(unit)], capture_output=True, text=True, check=False, timeout=60)
-    assert (said.returncode, said.stderr) == (0, '')
+    done = subprocess.run(['systemd-analyze', 'verify', str(unit)], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (0, '')
 
 
 @pytest.mark.parametrize(('environ', 'spool', 'bind'), [
@@ -178,11 +178,13 @@ def test_systemd_accepts_the_units(unit: Path) -> None:
     ({'SHADOWHOUND_HOME': '/data/a robot', 'SHADOWHOUND_LIVE_BIND': '0.0.0.0'}, '/data/a robot/spool', '0.0.0.0'),
 ])  # fmt: skip
 def test_the_live_page_is_started_with_arguments_that_it_takes(environ: dict[str, str], spool: str, bind: str) -> None:
-    """The spool of the node, named because there is none before the node has run, and where to listen."""
+    """The node's spool, which may not exist yet, and the address to listen on."""
     words = script(section(LIVE)).rpartition('/shadowhound-data"')[2]
     given = {'PATH': os.environ['PATH'], 'HOME': '/home/go2', **environ}
-    said = subprocess.run(['bash', '-c', f"printf '%s\\n' {words}"], env=given, capture_output=True, text=True, check=True).stdout
-    verb, *arguments = said.splitlines()
+    output = subprocess.run(
+        ['bash', '-c', f"printf '%s\\n' {words}"], env=given, capture_output=True, text=True, check=True
+    ).stdout
+    verb, *arguments = output.splitlines()
     with cli.commands[verb].make_context(verb, arguments) as context:
         assert (context.params['spool'], context.params['bind']) == (Path(spool), bind)
 
@@ -197,5 +199,5 @@ def test_the_live_page_reads_what_the_logger_writes() -> None:
 
 @pytest.mark.parametrize('unit', UNITS, ids=lambda unit: unit.stem)
 def test_no_service_leaves_its_memory_on_the_disk(unit: Path) -> None:
-    """A core dump would have the keys of the store and the passwords of MLflow in it."""
+    """A core dump would contain the keys of the store and the passwords of MLflow."""
     assert section(unit)['LimitCORE'] == '0'

@@ -1,4 +1,4 @@
-"""Facts that several files of the package state are the same in all of them."""
+"""Facts that several files of the repository state agree."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def console_scripts() -> list[str]:
 
 
 def test_the_version_is_the_same_everywhere() -> None:
-    """package.xml, setup.py and the changelog's newest heading, where there is one, name the same version."""
+    """package.xml, setup.py and the changelog's newest heading, if it has one, name the same version."""
     version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
     assert version == setup_arguments()['version']
     headings = re.findall(r'^(\d+\.\d+\.\d+) \(', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
@@ -70,7 +70,7 @@ def test_the_version_is_the_same_everywhere() -> None:
 
 
 def test_the_package_is_registered_under_its_name() -> None:
-    """The marker that ROS looks for has the name of the package and is installed."""
+    """The marker that ROS looks up has the name of the package and is installed."""
     name = ElementTree.parse(ROOT / 'package.xml').findtext('name')
     assert setup_arguments().get('name', name) == name
     assert (ROOT / 'resource' / str(name)).is_file()
@@ -79,7 +79,7 @@ def test_the_package_is_registered_under_its_name() -> None:
 
 @pytest.mark.parametrize('point', console_scripts())
 def test_an_entry_point_leads_to_a_function(point: str) -> None:
-    """A command that is installed can be started: its module imports and has the function."""
+    """The module of an installed command can be imported and has the function."""
     module, _, function = point.partition(' = ')[2].partition(':')
     if module.split('.')[1] == 'node' and importlib.util.find_spec('rclpy') is None:
         pytest.skip('this command needs ROS')
@@ -93,7 +93,7 @@ def test_setup_py_and_the_lock_files_agree() -> None:
 
 @pytest.mark.parametrize('name', sorted(path.name for path in REQUIREMENTS.glob('*.in')))
 def test_every_dependency_has_its_reason(name: str) -> None:
-    """docs/dependencies.md names each package that a .in file asks for."""
+    """docs/dependencies.md names each package in a .in file."""
     page = set(re.findall(r'[a-z0-9_.-]+', (ROOT / 'docs' / 'dependencies.md').read_text().lower()))
     wanted = {package.split('[')[0] for package in requirements(name)}
     assert wanted, name
@@ -101,7 +101,7 @@ def test_every_dependency_has_its_reason(name: str) -> None:
 
 
 def imported() -> set[str]:
-    """The packages that the library's modules import, by the names that pip (for gi apt) knows; ROS and types aside."""
+    """The packages that the library's modules import, by their names for pip (gi: for apt), without ROS and type checking."""
     found: set[str] = set()
     for path in (path for folder in OURS for path in (ROOT / folder).rglob('*.py')):
         text = re.sub(r'^if TYPE_CHECKING:\n(?: .*\n|\n)*', '', path.read_text(), flags=re.MULTILINE)
@@ -111,15 +111,15 @@ def imported() -> set[str]:
 
 
 def test_every_import_is_a_dependency() -> None:
-    """By setup.py, or by what docs/dependencies.md says of it; and that names nothing that is not imported."""
-    told = setup_arguments()
-    asked = [*told['install_requires'], *(each for extra in told['extras_require'].values() for each in extra)]
-    names = {re.split(r'[^A-Za-z0-9_-]', each)[0].lower() for each in asked}
+    """In setup.py or in docs/dependencies.md, which lists no package that is not imported."""
+    arguments = setup_arguments()
+    required = [*arguments['install_requires'], *(each for extra in arguments['extras_require'].values() for each in extra)]
+    names = {re.split(r'[^A-Za-z0-9_-]', each)[0].lower() for each in required}
     page = (ROOT / 'docs' / 'dependencies.md').read_text()
     section = page.partition('### Imported, and brought by something else')[2].partition('\n## ')[0]
-    brought = {name for row in re.findall(r'^\| ([^|]+) \|', section, re.MULTILINE)[1:] for name in row.split(', ')}
+    transitive = {name for row in re.findall(r'^\| ([^|]+) \|', section, re.MULTILINE)[1:] for name in row.split(', ')}
     found = imported()
-    assert brought == found - names
+    assert transitive == found - names
     assert found & names <= set(re.findall(r'[a-z0-9_.-]+', page.lower()))
 
 
@@ -172,7 +172,7 @@ def test_with_lyrical_numpy_and_empy_are_unpinned() -> None:
 
 
 def test_the_shared_memory_segment_holds_a_second_of_raw_images() -> None:
-    """The Fast DDS profile is the default one, uses its transports, and its segment is at least 32 MiB."""
+    """The Fast DDS profile is the default profile, uses its transports, and its segment has at least 32 MiB."""
     tree = ElementTree.parse(PROFILE)
     space = {'dds': 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'}
     transports = {t.findtext('dds:transport_id', '', space): t for t in tree.iterfind('.//dds:transport_descriptor', space)}
@@ -194,7 +194,7 @@ def test_every_message_definition_is_built() -> None:
 
 
 def test_no_file_names_a_package_index() -> None:
-    """Where packages come from is the machine's business: nothing in the repository ties it to one host."""
+    """The machine decides where packages come from; no file in the repository names a host."""
     if shutil.which('git') is None or not (ROOT / '.git').exists():
         pytest.skip('not a git checkout')
     hosts = ['pypi' + '.org', 'python' + 'hosted.org', 'registry.' + 'npmjs.org', 'deb.' + 'debian.org', 'index' + '-url =']
@@ -207,7 +207,7 @@ def test_no_file_names_a_package_index() -> None:
 
 @pytest.mark.parametrize('script', sorted(path.name for path in (ROOT / 'scripts').iterdir()))
 def test_a_script_is_executable_and_parses(script: str) -> None:
-    """The scripts are plain sh: dash and bash both read them."""
+    """The scripts are plain sh, for dash and bash."""
     path = ROOT / 'scripts' / script
     assert path.stat().st_mode & 0o111
     assert subprocess.run(['sh', '-n', str(path)], check=False, capture_output=True).returncode == 0
@@ -224,16 +224,16 @@ def test_a_commit_is_checked_as_make_check_does() -> None:
 
 
 def test_with_env_without_an_environment_has_a_remedy(tmp_path: Path) -> None:
-    """In a fresh clone it names `make setup` and fails."""
+    """In a fresh clone it fails and names `make setup`."""
     (tmp_path / 'scripts').mkdir()
     script = shutil.copy(ROOT / 'scripts' / 'with-env', tmp_path / 'scripts')
-    said = subprocess.run([script, 'true'], capture_output=True, text=True, check=False)
-    assert said.returncode == 1
-    assert 'make setup' in said.stderr
+    done = subprocess.run([script, 'true'], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert 'make setup' in done.stderr
 
 
 def test_with_env_keeps_a_profile_that_the_user_has_set(tmp_path: Path) -> None:
-    """A Fast DDS profile of the user's own is not replaced by ours."""
+    """Our Fast DDS profile does not replace the user's."""
     if not (ROOT / '.venv' / 'done').exists():
         pytest.skip('no environment made by scripts/setup')
     bare = {
@@ -247,5 +247,5 @@ def test_with_env_keeps_a_profile_that_the_user_has_set(tmp_path: Path) -> None:
             '-c',
             'echo "$FASTDDS_DEFAULT_PROFILES_FILE$FASTRTPS_DEFAULT_PROFILES_FILE"',
         ]
-        said = subprocess.run(command, capture_output=True, text=True, check=False, env=variables)
-        assert Path(said.stdout.strip()).name == expected, said.stderr
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=variables)
+        assert Path(done.stdout.strip()).name == expected, done.stderr

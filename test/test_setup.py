@@ -1,6 +1,6 @@
-"""Which Python `make setup` takes where no ROS is sourced: one that serves, wherever it is, or a line on what to install.
+"""Which Python `make setup` uses without a sourced ROS: a suitable one, wherever it is, or an error on what to install.
 
-Each Python here is this one, which says that it is another version; it makes no environment, and the script names it then.
+Each Python here is the running one, which claims another version and fails to create the environment, so the script names it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PLACES = {'PATH': 'bin/{}', 'pyenv': 'home/.pyenv/versions/{}.1/bin/python3', 'u
 
 
 class Machine:
-    """A checkout, a home and a PATH of their own, with the tools that the script needs and no Python."""
+    """A separate checkout, home and PATH, with the tools that the script needs and no Python."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -36,11 +36,11 @@ class Machine:
             (checkout / name).symlink_to(ROOT / name)
 
     def python(self, where: str, version: str, *, makes_venvs: bool = True) -> Path:
-        """One that says that it is of this version, such as 3.12."""
+        """Add a Python that claims a version such as 3.12."""
         path = self.folder / PLACES[where].format(f'python{version}' if where == 'PATH' else version)
-        said = f'import sys; sys.version_info = ({version.replace(".", ", ")}, 1)'
+        claim = f'import sys; sys.version_info = ({version.replace(".", ", ")}, 1)'
         hidden = '' if makes_venvs else "; sys.modules['ensurepip'] = None"
-        _program(path, f"""[ "$1" = -c ] || exit 1\nexec {sys.executable} -c "{said}{hidden}; $2"\n""")
+        _program(path, f"""[ "$1" = -c ] || exit 1\nexec {sys.executable} -c "{claim}{hidden}; $2"\n""")
         if where == 'uv':
             known = self.folder / 'known'
             with known.open('a') as file:
@@ -49,18 +49,18 @@ class Machine:
         return path
 
     def setup(self) -> str:
-        """What the script says; it never succeeds here."""
+        """The errors of the script, which never succeeds here."""
         environ = {'PATH': str(self.folder / 'bin'), 'HOME': str(self.folder / 'home'), 'LANG': os.environ.get('LANG', 'C')}
         command = [str(self.folder / 'checkout' / 'scripts' / 'setup')]
-        said = subprocess.run(command, capture_output=True, text=True, check=False, env=environ, timeout=60)
-        assert said.returncode == 1
-        return said.stderr
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environ, timeout=60)
+        assert done.returncode == 1
+        return done.stderr
 
     def taken(self) -> str:
-        """The Python that the script takes."""
-        said = self.setup()
-        found = re.search(r'could not make a virtual environment with (\S+)\.$', said, re.MULTILINE)
-        assert found, said
+        """The Python that the script uses."""
+        errors = self.setup()
+        found = re.search(r'could not make a virtual environment with (\S+)\.$', errors, re.MULTILINE)
+        assert found, errors
         return found[1]
 
 
@@ -76,7 +76,7 @@ def machine(tmp_path: Path) -> Machine:
 
 
 def test_a_python_on_the_path_is_used(machine: Machine) -> None:
-    """It goes before those of pyenv and uv."""
+    """It takes precedence over those of pyenv and uv."""
     for where, version in (('PATH', '3.12'), ('pyenv', '3.10'), ('uv', '3.11')):
         machine.python(where, version)
     assert machine.taken() == 'python3.12'
@@ -84,31 +84,31 @@ def test_a_python_on_the_path_is_used(machine: Machine) -> None:
 
 @pytest.mark.parametrize('where', ['pyenv', 'uv'])
 def test_a_python_outside_the_path_is_found(machine: Machine, where: str) -> None:
-    """Where the one on PATH is newer than the ROS wheels, and so are others."""
+    """If those on PATH are newer than the ROS wheels support."""
     machine.python('PATH', '3.13')
     machine.python(where, '3.14')
     machine.python(where, '3.9')
-    serves = machine.python(where, '3.11')
-    assert machine.taken() == str(serves)
+    suitable = machine.python(where, '3.11')
+    assert machine.taken() == str(suitable)
 
 
 def test_only_a_python_that_makes_environments_is_used(machine: Machine) -> None:
-    """A Python without venv, as Debian has it, gives way to one that has it."""
+    """A Python without venv, such as Debian's, is skipped."""
     machine.python('PATH', '3.11', makes_venvs=False)
-    serves = machine.python('uv', '3.12')
-    assert machine.taken() == str(serves)
+    suitable = machine.python('uv', '3.12')
+    assert machine.taken() == str(suitable)
 
 
 def test_missing_programs_are_reported(machine: Machine) -> None:
-    """A Python that lacks nothing but venv is named, with the package that has it."""
+    """A Python that lacks only venv is named, with the package to install."""
     machine.python('PATH', '3.11', makes_venvs=False)
-    said = machine.setup()
-    assert 'python3.11 cannot make virtual environments' in said
-    assert 'apt install python3-venv' in said
+    errors = machine.setup()
+    assert 'python3.11 cannot make virtual environments' in errors
+    assert 'apt install python3-venv' in errors
 
 
 def test_without_a_suitable_python_the_remedy_is_named(machine: Machine) -> None:
-    """One line says which to install, and how."""
+    """One line names the versions and how to install one."""
     for where in ('PATH', 'pyenv', 'uv'):
         machine.python(where, '3.13')
     (line,) = machine.setup().splitlines()

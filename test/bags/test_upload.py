@@ -163,7 +163,7 @@ def test_an_unfinished_bag_is_refused(settings: Settings, tmp_path: Path, what: 
 
 
 def test_a_bag_that_changes_after_it_was_spooled_is_reported(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
-    """Small files are sent as they were; a changed slice is refused, and never sent under its name."""
+    """Small files are sent unchanged; a changed slice is refused and never sent under its name."""
     write_ours(tmp_path / NAME, slices=2, each=1500)
     before = contents(tmp_path / NAME)
     with (

@@ -1,4 +1,4 @@
-"""``shadowhound-data bag`` as a user runs it: what it says, its exit codes, and its JSON."""
+"""``shadowhound-data bag`` as a user runs it: output, exit codes and JSON."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shadowhound_data_logger.stores import open_store
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """With a bag in the folder that is the store."""
+    """A home with a bag in its folder store."""
     write_ours(tmp_path / 'home' / 'store' / BUCKET / 'thor' / 'rosbags' / NAME)
     return tmp_path / 'home'
 
@@ -35,12 +35,12 @@ def run(home: Path, *arguments: str | Path, **environ: str) -> Result:
     return CliRunner().invoke(bag, [str(each) for each in arguments], env=env, standalone_mode=False)
 
 
-def said(result: Result) -> object:
+def parsed(result: Result) -> object:
     return json.loads(result.stdout)
 
 
 def test_bags_are_listed(home: Path) -> None:
-    """A line a bag; nothing there is no error, and says where it looked."""
+    """One line per bag; an empty list is not an error and names where it looked."""
     found = run(home, 'list')
     assert found.return_value == 0
     for text in (NAME, 'complete', '2025-10-18 12:00:00', '15 s', '1,650', 'store'):
@@ -50,26 +50,26 @@ def test_bags_are_listed(home: Path) -> None:
     assert row['t_start'] == '2025-10-18T12:00:00.000000000Z'
     empty = run(home, 'list', '--robot', 'tachi')
     assert (empty.return_value, 'There is no bag of tachi, neither in the folder' in empty.output) == (0, True)
-    assert said(run(home, 'list', '--since', '2026-01-01', '--json')) == []
+    assert parsed(run(home, 'list', '--since', '2026-01-01', '--json')) == []
     for since in ('yesterday', '2w', '20260101'):
-        assert said(run(home, 'list', '--since', since, '--json')) == []
-    assert len(said(run(home, 'list', '--since', '2025-10-18T14:00:00+02:00', '--json'))) == 1  # type: ignore[arg-type]
+        assert parsed(run(home, 'list', '--since', since, '--json')) == []
+    assert len(parsed(run(home, 'list', '--since', '2025-10-18T14:00:00+02:00', '--json'))) == 1  # type: ignore[arg-type]
 
 
 def test_info_shows_topics_and_slices(home: Path) -> None:
-    """Topics with types and rates, and the slices; of a folder the same."""
+    """Topics with types and rates, and the slices; the same for a folder."""
     found = run(home, 'info', NAME)
     assert found.return_value == 0
     for text in ('/imu', 'std_msgs/msg/String', '100.0 Hz', '/camera/blob', '9.9 Hz', f'{NAME}_2.mcap', 'ROS humble'):
         assert text in found.output
-    told = json.loads(run(home, 'info', NAME, '--json').output)
-    assert {topic['name']: topic['messages'] for topic in told['topics']} == {'/imu': 1500, '/camera/blob': 150}
+    info = json.loads(run(home, 'info', NAME, '--json').output)
+    assert {topic['name']: topic['messages'] for topic in info['topics']} == {'/imu': 1500, '/camera/blob': 150}
     folder = home / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
-    assert json.loads(run(home, 'info', folder, '--json').output)['messages'] == told['messages'] == 1650
+    assert json.loads(run(home, 'info', folder, '--json').output)['messages'] == info['messages'] == 1650
 
 
 def test_verify_has_an_exit_code_for_each_result(home: Path) -> None:
-    """0 for a whole bag, 1 for one that is damaged, or growing."""
+    """0 for an intact bag, 1 for one that is damaged or still growing."""
     assert run(home, 'verify', NAME).return_value == 0
     folder = home / 'store' / BUCKET / 'thor' / 'rosbags' / NAME
     assert run(home, 'verify', '--deep', folder).return_value == 0
@@ -82,26 +82,26 @@ def test_verify_has_an_exit_code_for_each_result(home: Path) -> None:
     path.unlink()
     found = run(home, 'verify', NAME)
     assert (found.return_value, 'still growing' in found.output) == (1, True)
-    assert said(run(home, 'verify', NAME, '--json'))['is_complete'] is False  # type: ignore[index]
+    assert parsed(run(home, 'verify', NAME, '--json'))['is_complete'] is False  # type: ignore[index]
 
 
 def test_a_second_fetch_downloads_nothing_and_a_cut_reads_little(home: Path, tmp_path: Path) -> None:
-    """A second fetch says that nothing was downloaded; a cut says how little was read."""
+    """A second fetch reports 0 bytes; a cut reports how much it read."""
     assert 'downloaded 3' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
     assert 'downloaded 0 B' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
     found = run(
         home, 'cut', NAME, '--start', '-2', '--topic', 'imu', '--topic', '/camera/blob', '--to', tmp_path / 'piece', '--json'
     )
-    told = json.loads(found.output)
-    assert (found.return_value, told['topics'], told['messages']) == (0, 2, 221)
-    assert told['read_bytes'] < told['bag_bytes'] / 3
+    report = json.loads(found.output)
+    assert (found.return_value, report['topics'], report['messages']) == (0, 2, 221)
+    assert report['read_bytes'] < report['bag_bytes'] / 3
     found = run(home, 'cut', tmp_path / 'here' / NAME, '--end', '1', '--regex', 'imu', '--to', tmp_path / 'other')
     assert '100 messages on 1 topic,' in found.output
     assert run(home, 'verify', tmp_path / 'other').return_value == 0
 
 
 def test_uploaded_and_watched_bags_are_confirmed_by_the_store(home: Path, tmp_path: Path) -> None:
-    """Confirmed by the store, and found there."""
+    """Afterwards they are listed."""
     write_ours(tmp_path / 'recordings' / 'by_hand', slices=1, each=20)
     found = run(home, 'upload', tmp_path / 'recordings' / 'by_hand', '--bag-name', 'named')
     assert (found.return_value, 'confirmed by the store' in found.output) == (0, True)
@@ -114,12 +114,12 @@ def test_uploaded_and_watched_bags_are_confirmed_by_the_store(home: Path, tmp_pa
 
 
 def test_an_unreachable_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> None:
-    """Exit code 1 and why; a list says that the store is away, and what is here all the same."""
+    """Exit code 1 with the reason; ``list`` reports the unreachable store and lists the local bags anyway."""
     write_ours(tmp_path / 'by_hand', slices=1, each=20)
-    away = {'AWS_ENDPOINT_URL': 'http://127.0.0.1:9', 'AWS_ACCESS_KEY_ID': 'k', 'AWS_SECRET_ACCESS_KEY': 's'}
-    found = run(home, 'upload', tmp_path / 'by_hand', '--timeout', '0.5', **away)
+    unreachable = {'AWS_ENDPOINT_URL': 'http://127.0.0.1:9', 'AWS_ACCESS_KEY_ID': 'k', 'AWS_SECRET_ACCESS_KEY': 's'}
+    found = run(home, 'upload', tmp_path / 'by_hand', '--timeout', '0.5', **unreachable)
     assert (found.return_value, '3 of 3 files wait in the spool' in found.output) == (1, True)
-    found = run(home, 'list', '--json', **away)
+    found = run(home, 'list', '--json', **unreachable)
     assert (found.return_value, '127.0.0.1:9' in found.stderr) == (1, True)
     assert [row['bag'] for row in json.loads(found.stdout)] == ['by_hand']
     (row,) = [row for row in json.loads(run(home, 'list', '--json').output) if row['bag'] == 'by_hand']
@@ -136,14 +136,14 @@ def test_an_unreachable_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path)
     (('info', 'a b'), Exception, 'cannot be part of an object key'),
 ])  # fmt: skip
 def test_errors_have_remedies(home: Path, arguments: tuple[str, ...], error: type[Exception], text: str) -> None:
-    """By name, value and remedy."""
+    """Each names the value and what is allowed."""
     found = run(home, *arguments)
     assert isinstance(found.exception, error)
     assert text in getattr(found.exception, 'message', str(found.exception))
 
 
 def test_every_verb_works_with_an_s3_server(seaweed: Tower, tmp_path: Path) -> None:
-    """The whole round over S3: send, list, look, check, download, cut."""
+    """Upload, list, info, verify, fetch and cut over S3."""
     write_ours(tmp_path / 'far')
     environ = seaweed.environment()
     home = tmp_path / 'home'
@@ -166,7 +166,7 @@ def test_every_verb_works_with_an_s3_server(seaweed: Tower, tmp_path: Path) -> N
 
 
 def test_reading_needs_neither_ros_nor_a_spool(home: Path) -> None:
-    """On the machine where the data are used none of it is there; and looking leaves nothing behind."""
+    """A workstation has neither; and reading creates no files."""
     program = (
         'import sys\n'
         'from shadowhound_data_logger.cli.main import cli\n'
@@ -182,14 +182,14 @@ def test_reading_needs_neither_ros_nor_a_spool(home: Path) -> None:
 
 @pytest.mark.parametrize('verb', ['list', 'info', 'verify', 'fetch', 'cut', 'upload', 'watch', 'record'])
 def test_the_help_has_every_verb(verb: str) -> None:
-    """Every option has a text, and the verb says what it does."""
+    """For the verb and each of its options."""
     command = bag.commands[verb]
     assert command.help
     assert all(option.help for option in command.params if isinstance(option, click.Option))
 
 
 def test_a_bag_whose_times_are_counters_has_no_rates(tmp_path: Path) -> None:
-    """Some 400 ns have no rates, shares stay below 100 %, one is no plural, and a file in a folder needs no fetch."""
+    """A bag of 400 ns has no rates, percentages stay below 100, and counts of one are singular."""
     home, folder = tmp_path / 'home', tmp_path / 'b'
 
     def fill(writer: Writer) -> None:
@@ -218,7 +218,7 @@ def test_a_bag_whose_times_are_counters_has_no_rates(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('verb', ['info', 'verify', 'cut'])
 def test_a_folder_without_a_slash_is_hinted_at(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
-    """A name is that of a bag in the store; where only a folder has it, the error says how a folder is written."""
+    """A plain name refers to a bag in the store; if only a folder has that name, the error suggests ./NAME."""
     monkeypatch.chdir(tmp_path)
     write_ours(tmp_path / 'mine')
     error = run(home, verb, 'mine', *(('--to', tmp_path / 'other') if verb == 'cut' else ())).exception
@@ -227,7 +227,7 @@ def test_a_folder_without_a_slash_is_hinted_at(home: Path, tmp_path: Path, monke
 
 
 def test_repair_reports_damage_and_losses(tmp_path: Path) -> None:
-    """It says what was damaged, lost and rebuilt, in words and as JSON; exit code 1 if something was, 0 if nothing is."""
+    """As text and JSON: damaged, lost and rebuilt parts; exit code 1 if there are any, otherwise 0."""
     folder = tmp_path / NAME
     write_ours(folder)
     whole = run(tmp_path, 'repair', folder)
@@ -239,10 +239,10 @@ def test_repair_reports_damage_and_losses(tmp_path: Path) -> None:
     for text in (f'{NAME}_repaired: ', '1 of them damaged', 'a truncated chunk', 'rebuilt: the summary and the footer'):
         assert text in found.output
     assert run(tmp_path, 'verify', f'{folder}_repaired', '--deep').return_value == 0
-    told = said(run(tmp_path, 'repair', folder, '--to', tmp_path / 'other', '--json'))
-    assert isinstance(told, dict)
-    assert (told['out'], told['is_damaged']) == (str(tmp_path / 'other'), True)
-    (file,) = [each for each in told['files'] if each['losses']]
+    report = parsed(run(tmp_path, 'repair', folder, '--to', tmp_path / 'other', '--json'))
+    assert isinstance(report, dict)
+    assert (report['out'], report['is_damaged']) == (str(tmp_path / 'other'), True)
+    (file,) = [each for each in report['files'] if each['losses']]
     assert (file['name'], file['messages'] + file['lost_messages'], file['losses'][0]['messages']) == (torn.name, 550, None)
     assert 'already exists' in str(run(tmp_path, 'repair', folder).exception)
     assert 'exclude each other' in str(run(tmp_path, 'repair', folder, '--in-place', '--to', 'x').exception)
@@ -251,7 +251,7 @@ def test_repair_reports_damage_and_losses(tmp_path: Path) -> None:
 
 
 def test_a_torn_bag_has_a_remedy(tmp_path: Path) -> None:
-    """Whichever verb comes upon it."""
+    """With every verb that reads it."""
     folder = tmp_path / NAME
     write_ours(folder)
     torn = folder / f'{NAME}_1.mcap'

@@ -1,4 +1,4 @@
-"""An option means the same in every verb, and what means the same has one name."""
+"""An option has the same meaning in every verb, and one meaning has one name."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TWO_MEANINGS = {
     '--topic': 'a filter of results, or several topics of one bag',
     '--key': 'keys of the root sign together, other keys alone',
 }
-"""Options with two help texts -> why: each has been looked at."""
+"""Options with two help texts -> the reason."""
 
 
 def options() -> Iterator[tuple[str, str, click.Option]]:
@@ -30,17 +30,17 @@ def options() -> Iterator[tuple[str, str, click.Option]]:
 
 
 def meaning(option: click.Option) -> str:
-    """Its help without the default, which verbs may differ in."""
+    """The help without the default, which may differ between verbs."""
     return (option.help or '').partition('  [default')[0].rstrip('.')
 
 
 def shape(option: click.Option) -> tuple[object, ...]:
-    """What a value looks like; limits and choices may differ."""
+    """The kind of the option's value; limits and choices may differ."""
     return option.is_flag, option.multiple, option.nargs, option.metavar if not isinstance(option.type, click.Choice) else None
 
 
 def test_an_option_means_the_same_in_every_verb() -> None:
-    """One help text for each name, but for those that are listed with a reason."""
+    """Each name has one help text, except for those listed with a reason."""
     found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     for verb, name, option in options():
         found[name][meaning(option)].append(verb)
@@ -50,7 +50,7 @@ def test_an_option_means_the_same_in_every_verb() -> None:
 
 
 def test_an_option_takes_the_same_in_every_verb() -> None:
-    """A flag is not an option with a value elsewhere, and what is repeated in one verb is repeated in all."""
+    """An option is a flag, or repeatable, in all verbs or in none."""
     found: dict[tuple[str, str], dict[tuple[object, ...], list[str]]] = defaultdict(lambda: defaultdict(list))
     for verb, name, option in options():
         found[name, meaning(option)][shape(option)].append(verb)
@@ -62,7 +62,7 @@ SHAPES = {'--to': 'a file, a folder, or a place in a store'}
 
 
 def test_what_means_the_same_has_one_name() -> None:
-    """No help text stands at two options; -v is short for --verbose."""
+    """No two options have the same help; -v is short for --verbose."""
     found: dict[str, set[str]] = defaultdict(set)
     for _, name, option in options():
         if name.startswith('--'):
@@ -71,7 +71,7 @@ def test_what_means_the_same_has_one_name() -> None:
 
 
 def test_every_option_has_help() -> None:
-    """And a name for its value, where click would print TEXT."""
+    """And a name for its value instead of click's TEXT."""
     assert [f'{verb} {name}' for verb, name, option in options() if not option.help] == []
 
 
@@ -84,7 +84,7 @@ def test_sizes_are_read(text: str, size: int) -> None:
 
 
 def test_ages_are_read() -> None:
-    """Within their limit."""
+    """Up to a limit."""
     assert Age().convert('0h', None, None) == 0
     assert Age(DAY_NS).convert('90min', None, None) == 5400 * 10**9
     for text in ('much', '-1h', '0h', '2d', '2026-11-20'):

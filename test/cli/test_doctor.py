@@ -1,4 +1,4 @@
-"""``shadowhound-data doctor``: what it prints, its JSON, its exit codes, and what --fix does and leaves alone."""
+"""``shadowhound-data doctor``: output, JSON, exit codes, and what --fix changes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SAID = model.info('some.info', 'good to know')
 
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch) -> list[model.Result]:
-    """What the only check there is finds."""
+    """The results of the only check."""
     results: list[model.Result] = []
 
     def run(_: Context) -> Iterator[model.Result]:
@@ -45,7 +45,7 @@ def run(folder: Path, *arguments: str, **environ: str | None) -> Result:
 
 
 def test_findings_come_after_the_verdict(found: list[model.Result], tmp_path: Path) -> None:
-    """Errors before warnings, each with what was seen, why, and a command that is in one line."""
+    """Errors before warnings, each with the observation, the reason, and a command on one line."""
     found += [FINE, ODD, SAID, BAD]
     answer = run(tmp_path, '--role', 'robot')
     assert answer.return_value == 1
@@ -59,7 +59,7 @@ def test_findings_come_after_the_verdict(found: list[model.Result], tmp_path: Pa
 
 
 def test_without_findings_the_exit_code_is_0(found: list[model.Result], tmp_path: Path) -> None:
-    """Exit code 0, also where there is something good to know; -v shows what is fine."""
+    """Information does not change it; -v shows passed checks."""
     found += [FINE, SAID]
     answer = run(tmp_path, '-v')
     assert answer.return_value == 0
@@ -68,22 +68,22 @@ def test_without_findings_the_exit_code_is_0(found: list[model.Result], tmp_path
 
 
 def test_json_is_one_document(found: list[model.Result], tmp_path: Path) -> None:
-    """One document, whatever was found."""
+    """With the verdict and all results."""
     found += [FINE, BAD]
     answer = run(tmp_path, '--json', '--role', 'workstation', SHADOWHOUND_ROBOT='tachi')
-    said: dict[str, Any] = json.loads(answer.stdout)
+    document: dict[str, Any] = json.loads(answer.stdout)
     assert answer.return_value == 1
-    assert {**said, 'took_s': 0, 'results': []} == {
+    assert {**document, 'took_s': 0, 'results': []} == {
         'role': 'workstation', 'robot': 'tachi', 'ok': False, 'took_s': 0, 'findings': 1, 'results': [], 'fixed': [],
     }  # fmt: skip
-    assert said['results'][1] == {
+    assert document['results'][1] == {
         'check': 'some.thing', 'severity': 'error', 'seen': BAD.seen, 'cause': 'the cause', 'remedy': BAD.remedy,
-        'took_s': said['results'][1]['took_s'], 'fix': [], 'data': {},
+        'took_s': document['results'][1]['took_s'], 'fix': [], 'data': {},
     }  # fmt: skip
 
 
 def test_checks_are_selected_by_name_or_prefix(found: list[model.Result], tmp_path: Path) -> None:
-    """A name, or what names begin with."""
+    """``--only`` takes the name of a check or its prefix."""
     found.append(BAD)
     assert run(tmp_path, '--only', 'some.part').return_value == 0
     assert run(tmp_path, '--only', 'some').return_value == 1
@@ -102,14 +102,14 @@ def test_checks_are_selected_by_name_or_prefix(found: list[model.Result], tmp_pa
 def test_an_unknown_check_is_wrong_usage(
     found: list[model.Result], tmp_path: Path, arguments: tuple[str, ...], words: str
 ) -> None:
-    """Is refused with what is allowed, before anything is asked."""
+    """The error lists the checks; none has run."""
     error = run(tmp_path, *arguments).exception
     assert isinstance(error, click.UsageError)
     assert words in f'{error.format_message()} {getattr(error, "remedy", "")}'
 
 
 def test_an_invalid_parameter_file_is_wrong_usage(found: list[model.Result], tmp_path: Path) -> None:
-    """Is bad usage as well, and names the file."""
+    """The error names the file."""
     (tmp_path / 'a.yaml').write_text('- no mapping')
     error = run(tmp_path, '--params-file', str(tmp_path / 'a.yaml')).exception
     assert isinstance(error, click.UsageError)
@@ -117,7 +117,7 @@ def test_an_invalid_parameter_file_is_wrong_usage(found: list[model.Result], tmp
 
 
 def test_a_setting_that_the_node_would_refuse_is_a_finding(tmp_path: Path) -> None:
-    """Of the parameter file it was given, by the real check."""
+    """In the parameter file that was passed."""
     (tmp_path / 'a.yaml').write_text('/**:\n  ros__parameters:\n    camera:\n      rate: 3.0\n    imu: {batch_s: 2.0}\n')
     answer = run(tmp_path, '--params-file', str(tmp_path / 'a.yaml'), '--only', 'environment', '--json')
     found = {result['check']: result for result in json.loads(answer.stdout)['results']}
@@ -125,7 +125,7 @@ def test_a_setting_that_the_node_would_refuse_is_a_finding(tmp_path: Path) -> No
 
 
 def test_fix_narrows_a_mode_and_nothing_else(tmp_path: Path) -> None:
-    """The file of keys is for its owner alone afterwards; what has to be pasted is still a finding."""
+    """The key file becomes readable by its owner only; findings that need a command remain."""
     path = tmp_path / '.aws/credentials'
     path.parent.mkdir()
     path.write_text('[default]\naws_access_key_id = a\naws_secret_access_key = b\n')
@@ -143,7 +143,7 @@ def test_fix_narrows_a_mode_and_nothing_else(tmp_path: Path) -> None:
 
 @pytest.mark.seaweedfs
 def test_fix_creates_buckets_where_the_keys_allow_it(tmp_path: Path, seaweed: Tower) -> None:
-    """And says why not where they do not."""
+    """Otherwise it prints the reason."""
     name = f'b{tmp_path.name.replace("_", "-")[:40]}'
     (tmp_path / 'a.yaml').write_text(f'/**:\n  ros__parameters:\n    sensors: [imu]\n    imu: {{bucket: {name}}}\n')
     asked = ('--role', 'robot', '--only', 's3', '--params-file', str(tmp_path / 'a.yaml'), '--fix')

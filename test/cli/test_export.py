@@ -1,4 +1,4 @@
-"""``shadowhound-data export`` on two machines that share a store: no episode is lost, and a dropped one is gone."""
+"""``shadowhound-data export`` on two machines that share a store: no episode is lost, and a dropped one is deleted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.long('exports again and again')
 
 
 class Machine:
-    """With a home of its own, and the store of all."""
+    """A machine with a separate home and the shared store."""
 
     def __init__(self, folder: Path, store: Path) -> None:
         self.home = folder
@@ -39,7 +39,7 @@ class Machine:
         return json.loads(ran.stdout)
 
     def add(self, mission: str, to: str = URL, code: ExitCode = ExitCode.FINE) -> list[str]:
-        """The missions that were added."""
+        """Export; returns the missions that were added."""
         return [
             each['mission_id'] for each in self.ask('lerobot', 'patrols', '--mission', mission, '--to', to, code=code)['added']
         ]
@@ -62,7 +62,7 @@ def machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Machine, 
 
 
 def test_two_machines_add_to_one_dataset(machines: tuple[Machine, Machine], tmp_path: Path) -> None:
-    """What the other one added is there still, in its place."""
+    """Episodes of the other machine keep their place."""
     a, b = machines
     assert a.add('one') == ['one']
     assert b.add('two') == ['two']
@@ -72,7 +72,7 @@ def test_two_machines_add_to_one_dataset(machines: tuple[Machine, Machine], tmp_
 
 
 def test_an_episode_is_taken_out_everywhere(machines: tuple[Machine, Machine], tmp_path: Path) -> None:
-    """Out of the store, of a folder, and of what was fetched; it comes back to none of them, whoever exports."""
+    """From the store, from a folder, and from a fetched copy; no later export adds it again."""
     a, b = machines
     a.add('one')
     a.add('two')
@@ -97,12 +97,12 @@ def test_an_episode_is_taken_out_everywhere(machines: tuple[Machine, Machine], t
 
 
 class CutOffError(Exception):
-    """The machine was switched off."""
+    """Stands for a machine that is switched off."""
 
 
 @pytest.fixture
 def cutting(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """Uploads end after so many files, until it is told another number."""
+    """Interrupts uploads after a number of files."""
     real, left = transfer._put, [1000]
 
     def put(*arguments: Any) -> int:
@@ -118,7 +118,7 @@ def cutting(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 @pytest.mark.parametrize('files', [0, 1, 5])
 def test_a_drop_completes_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None], files: int,
                                          tmp_path: Path) -> None:  # fmt: skip
-    """The other machine waits for it rather than bring the mission back; told again, the first one takes it out."""
+    """The other machine waits instead of adding the mission again; the first one drops it when it is run again."""
     a, b = machines
     a.add('one')
     b.add('two')
@@ -136,7 +136,7 @@ def test_a_drop_completes_an_interrupted_upload(machines: tuple[Machine, Machine
 
 
 def test_an_export_completes_an_interrupted_upload(machines: tuple[Machine, Machine], cutting: Callable[[int], None]) -> None:
-    """A mission is taken out of what only this machine has yet, and of what of it was uploaded."""
+    """A mission is dropped from the local copy and from the uploaded part of it."""
     a, b = machines
     a.add('one')
     cutting(4)
@@ -152,7 +152,7 @@ def test_an_export_completes_an_interrupted_upload(machines: tuple[Machine, Mach
 
 
 def test_the_last_episode_is_taken_out(machines: tuple[Machine, Machine]) -> None:
-    """An empty dataset is left, which remembers it; the next mission is its first episode."""
+    """An empty dataset remains, which remembers the drop; the next mission becomes its first episode."""
     a, b = machines
     a.add('one')
     assert {*a.ask('drop', 'one')} == {URL}
@@ -163,7 +163,7 @@ def test_the_last_episode_is_taken_out(machines: tuple[Machine, Machine]) -> Non
 
 
 def test_datasets_are_named_without_mlflow(machines: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which models were trained on them is not known then, which is not the same as none."""
+    """Their trained models are then unknown, which differs from an empty list."""
     a, _ = machines
     a.add('one')
     store = a.home / 'store/lerobot/datasets/go2/patrols'
@@ -179,7 +179,7 @@ def test_datasets_are_named_without_mlflow(machines: tuple[Machine, Machine], mo
 
 @pytest.mark.parametrize('flags', [('--mission', 'onne'), ('--mission-type', 'patrl'), ('--label', 'x'), ('--robot', 'thro')])
 def test_an_export_of_what_does_not_exist_is_wrong_usage(machines: tuple[Machine, Machine], flags: tuple[str, str]) -> None:
-    """As of a query; where no label exists at all, nothing is known of any."""
+    """As for a query; if no labels exist at all, any label is accepted."""
     if flags[0] == '--label':
         assert machines[0].ask('lerobot', 'patrols', *flags, '--dry-run')['added'] == []
         return

@@ -1,4 +1,4 @@
-"""``shadowhound-data fetch``: by prefix or by question, what it says, and its exit codes."""
+"""``shadowhound-data fetch`` by prefix or by query: output and exit codes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TIMES = [NOON_NS + second * SECOND for second in range(5)]
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Ten objects and their part of the catalog."""
+    """A store with ten objects and their part of the catalog."""
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
         for sensor in SENSORS:
             for stamp_ns in TIMES:
@@ -38,33 +38,33 @@ def run(home: Path, *arguments: str) -> Result:
 
 
 def files(home: Path) -> list[str]:
-    """What was fetched; the rows of it are beside."""
+    """The fetched files without the file of rows."""
     found = (str(path.relative_to(home / 'data')) for path in (home / 'data' / 'thor').rglob('*.*'))
     return sorted(name for name in found if '_catalog' not in name)
 
 
 def test_objects_are_fetched_by_prefix(home: Path) -> None:
-    """Each at DIR/KEY; a second time nothing is moved, and it says so."""
+    """Each to DIR/KEY; a second run transfers nothing and reports that."""
     found = run(home, 'thor/camera/')
     assert found.return_value == 0
     assert '5 objects' in found.output
     assert files(home) == sorted(row('camera', stamp_ns)['key'] for stamp_ns in TIMES)
-    told = json.loads(run(home, 'thor/camera/', '--json').output)
-    assert (told['moved'], told['present'], told['bytes']) == (0, 5, 0)
+    report = json.loads(run(home, 'thor/camera/', '--json').output)
+    assert (report['moved'], report['present'], report['bytes']) == (0, 5, 0)
     assert (home / 'data' / files(home)[0]).read_bytes() == content('camera', TIMES[0])
 
 
 def test_objects_are_fetched_by_query(home: Path) -> None:
-    """What the flags ask for, the earliest where there is a limit."""
-    told = json.loads(run(home, '--sensor', 'odom', '--since', '2026-10-28T12:00:01', '--limit', '2', '--json').output)
-    assert (told['asked'], told['moved']) == (2, 2)
+    """The selected objects; with --limit the earliest."""
+    report = json.loads(run(home, '--sensor', 'odom', '--since', '2026-10-28T12:00:01', '--limit', '2', '--json').output)
+    assert (report['asked'], report['moved']) == (2, 2)
     assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])
     assert 'No objects in the bucket sensor-data' in run(home, '--sensor', 'lidar').output
     assert 'No objects under thor/lidar/ in the bucket x' in run(home, 'thor/lidar/', '--bucket', 'x').output
 
 
 def test_an_object_that_cannot_be_fetched_is_a_finding(home: Path) -> None:
-    """Exit code 1, the key and the reason; the rest is there."""
+    """Exit code 1, with key and reason; the others are fetched."""
     gone = row('odom', TIMES[0])['key']
     (home / 'store' / 'sensor-data' / gone).unlink()
     found = run(home, '--sensor', 'odom')
@@ -75,38 +75,38 @@ def test_an_object_that_cannot_be_fetched_is_a_finding(home: Path) -> None:
 
 
 def test_a_repeat_is_not_fetched_twice(home: Path) -> None:
-    """What was stored once and seen again has two rows of one key: it is one object, which is fetched, and both rows are kept."""
+    """A repeated object has two rows with one key: it is fetched once, and both rows are kept."""
     again = {**row('odom', TIMES[0]), **dict.fromkeys(('t_start_ns', 't_end_ns'), TIMES[4] + SECOND)}
     again |= {name: again[f'{name}_ns'] // 1000 for name in ('t_start', 't_end')}
     with closing(open_store(folder_store(home), UploadSettings())) as store:
         add_part(store, [again], 'later', home / 'tmp')
-    told = json.loads(run(home, '--sensor', 'odom', '--json').output)
-    assert (told['asked'], told['moved'], told['failed']) == (5, 5, {})
+    report = json.loads(run(home, '--sensor', 'odom', '--json').output)
+    assert (report['asked'], report['moved'], report['failed']) == (5, 5, {})
     rows = query.objects(selecting.fetched(home / 'data')).to_pydict()['t_start_ns']
     assert sorted(rows) == sorted([*TIMES, again['t_start_ns']])
 
 
 def test_a_prefix_or_a_query_is_required(home: Path) -> None:
-    """Neither or both of prefix and question; a time that is none."""
+    """Neither or both, or an invalid time, is wrong usage."""
     for arguments in ([], ['thor/', '--sensor', 'odom'], ['--since', 'soon']):
         assert isinstance(run(home, *arguments).exception, click.UsageError)
 
 
 def test_objects_are_fetched_by_the_times_of_an_answer(home: Path) -> None:
-    """Objects that reach into one of them, of its robot."""
+    """Objects of the range's robot that overlap it."""
     times = [
         {'robot': 'thor', 'since_ns': TIMES[1], 'until_ns': TIMES[2]},
         {'robot': 'tachi', 'since_ns': 0, 'until_ns': TIMES[4]},
     ]
     file = home / 'times.json'
     file.write_text(json.dumps({'ranges': times}), encoding='utf-8')
-    told = json.loads(run(home, '--sensor', 'odom', '--ranges', str(file), '--json').output)
-    assert told['moved'] == 2
+    report = json.loads(run(home, '--sensor', 'odom', '--ranges', str(file), '--json').output)
+    assert report['moved'] == 2
     assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])
 
 
 def test_a_sensor_that_does_not_exist_is_wrong_usage(home: Path, tmp_path: Path) -> None:
-    """As of a query; nothing is fetched."""
+    """As for a query; nothing is fetched."""
     found = run(home, '--sensor', 'camra', '--to', str(tmp_path / 'data'))
     assert isinstance(found.exception, BadUsage)
     assert found.exception.message == "there is no sensor 'camra'"

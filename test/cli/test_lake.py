@@ -1,4 +1,4 @@
-"""``shadowhound-data lake``: what it says of the catalog, and that its verbs do what they say."""
+"""``shadowhound-data lake``: its verbs and what they print about the catalog."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(home: Path, *arguments: str) -> Result:
 
 
 def test_status_counts_waiting_and_ingested_rows(home: Path) -> None:
-    """Row files wait, then their rows are in the tables; a row that was rejected is counted."""
+    """Row files wait until they are ingested; rejected rows are counted."""
     (before,) = json.loads(run(home, 'status', '--json').output)
     assert (before['robot'], before['objects'], before['waiting'], before['first']) == ('thor', 0, 24, None)
     run(home, 'ingest')
@@ -43,7 +43,7 @@ def test_status_counts_waiting_and_ingested_rows(home: Path) -> None:
 
 
 def test_ingest_adds_each_row_once_and_names_what_it_rejects(home: Path) -> None:
-    """A second run finds nothing new; a file that is not one is named."""
+    """A second run finds nothing new; an invalid row file is named."""
     first = json.loads(run(home, 'ingest', '--json').output)
     assert (first['files'], first['rows'], first['repeated'], first['rejected']) == (24, 192, 0, 0)
     assert 'All row files are in the tables' in run(home, 'ingest').output
@@ -54,28 +54,28 @@ def test_ingest_adds_each_row_once_and_names_what_it_rejects(home: Path) -> None
 
 
 def test_an_empty_store_is_no_error(tmp_path: Path) -> None:
-    """There is nothing to say and nothing to do."""
+    """``status`` and ``ingest`` succeed."""
     assert 'no rows yet in the bucket sensor-data' in run(tmp_path, 'status').output
     assert run(tmp_path, 'ingest').exit_code == 0
 
 
 def test_reindex_reports_its_result(home: Path) -> None:
-    """Rows of objects that are gone are counted, objects without a row get one."""
-    told = json.loads(run(home, 'reindex', '--robot', 'thor', '--json').output)
-    assert told == {'listed': 2, 'added': 2, 'parts': 1, 'gone': 192}
+    """Rows of deleted objects are counted; objects without a row get one."""
+    report = json.loads(run(home, 'reindex', '--robot', 'thor', '--json').output)
+    assert report == {'listed': 2, 'added': 2, 'parts': 1, 'gone': 192}
     again = run(home, 'reindex', '--robot', 'thor')
     assert '0 were not in the catalog' in again.output
     assert '192 rows name objects that are gone' in again.output
 
 
 def ended(home: Path, *arguments: str) -> Result:
-    """With what the verb itself returned."""
+    """The result with the return value of the verb."""
     env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '150', 'AWS_ENDPOINT_URL': ''}
     return CliRunner().invoke(lake, arguments, env=env, standalone_mode=False)
 
 
 def test_prune_lists_deletions_and_confirms_a_complete_sensor(home: Path) -> None:
-    """Without a terminal it then does nothing; a dry run never does; what is referred to is named before it is forced."""
+    """Without a terminal it deletes nothing; nor does a dry run; objects that a label refers to need --force."""
     rules = ('prune', '--keep', 'camera 2026-10-29, odom forever, lidar 1d')
     dry = ended(home, *rules, '--dry-run')
     assert dry.return_value == 0
@@ -106,7 +106,7 @@ def test_prune_lists_deletions_and_confirms_a_complete_sensor(home: Path) -> Non
     (['--keep', 'camera 1d', '--robot', 'thro'], "is it 'thor'?"),
 ])  # fmt: skip
 def test_prune_takes_a_name_that_nothing_has_for_wrong_usage(home: Path, arguments: list[str], remedy: str) -> None:
-    """Nothing is deleted then, with --yes either; the nearest names are suggested."""
+    """Nothing is deleted, not even with --yes; the nearest names are suggested."""
     found = ended(home, 'prune', *arguments, '--yes')
     assert isinstance(found.exception, BadUsage)
     assert found.exception.remedy == remedy
@@ -114,13 +114,13 @@ def test_prune_takes_a_name_that_nothing_has_for_wrong_usage(home: Path, argumen
 
 
 def test_a_robot_is_required(home: Path) -> None:
-    """No robot."""
+    """``reindex`` without --robot is wrong usage."""
     assert run(home, 'reindex').exit_code == 2
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Path:
-    """Two topics of two hours: one downsampled and with a gap, one of which nothing is known in the second hour."""
+def gaps(tmp_path: Path) -> Path:
+    """Two hours of two topics: one with two gaps, and one that is downsampled and has no report for the second hour."""
     hour = 3600
     rows = [mark(hour), mark(2 * hour, 2), lost('1', 600, 660), lost('2', 7000, 7010, cause='queue_full'),
             mark(hour, topic='/odom', skipped=7)]  # fmt: skip
@@ -132,9 +132,9 @@ def told(tmp_path: Path) -> Path:
 TWO_HOURS = ('coverage', '--since', '2026-10-28T12:00', '--until', '2026-10-28T14:00')
 
 
-def test_coverage_is_printed_as_a_table(told: Path) -> None:
-    """What was stored, downsampled, lost and why, and what nobody knows, an hour a line."""
-    found = run(told, *TWO_HOURS)
+def test_coverage_is_printed_as_a_table(gaps: Path) -> None:
+    """One line per hour: stored, downsampled, lost with the cause, and unknown."""
+    found = run(gaps, *TWO_HOURS)
     assert found.exit_code == 0
     lines = [line.split() for line in found.stdout.splitlines()]
     assert lines[1:5] == [
@@ -146,9 +146,9 @@ def test_coverage_is_printed_as_a_table(told: Path) -> None:
     assert 'thor /odom: 12 messages were lost at unknown times.' in found.stdout
 
 
-def test_coverage_is_printed_as_json(told: Path) -> None:
-    """Seconds of each hour, and up to when it is known."""
-    (imu,) = json.loads(run(told, *TWO_HOURS, '--topic', '/imu', '--json').stdout)
+def test_coverage_is_printed_as_json(gaps: Path) -> None:
+    """Seconds per hour, and up to when they are known."""
+    (imu,) = json.loads(run(gaps, *TWO_HOURS, '--topic', '/imu', '--json').stdout)
     assert imu['hours'] == [
         {'begin': '2026-10-28T12:00Z', 'seconds': {'stored': 3540.0, 'transport': 60.0}},
         {'begin': '2026-10-28T13:00Z', 'seconds': {'queue_full': 10.0, 'stored': 3590.0}},
@@ -156,17 +156,17 @@ def test_coverage_is_printed_as_json(told: Path) -> None:
     assert (imu['complete_ns'], imu['gaps'], imu['untimed']) == (NOON_NS + 7200 * 10**9, 2, 0)
 
 
-def test_coverage_is_drawn_as_an_image(told: Path, tmp_path: Path) -> None:
-    """Blue where it is stored, red where it is lost, gray where nobody knows."""
-    assert run(told, *TWO_HOURS, '--chart', str(tmp_path / 'coverage.png')).exit_code == 0
+def test_coverage_is_drawn_as_an_image(gaps: Path, tmp_path: Path) -> None:
+    """Blue for stored, red for lost, gray for unknown."""
+    assert run(gaps, *TWO_HOURS, '--chart', str(tmp_path / 'coverage.png')).exit_code == 0
     with Image.open(tmp_path / 'coverage.png') as picture:
         colors = {color for _, color in picture.convert('RGB').getcolors(1 << 24) or ()}
     assert colors >= {(0x1F, 0x6F, 0xB2), (0xC0, 0x39, 0x2B), (0x9C, 0xC4, 0xE4), (0xC7, 0xCF, 0xD6)}
 
 
-def test_coverage_without_gap_reports_is_unknown(told: Path) -> None:
-    """A topic of which nothing is known is not known; a time that is none is bad usage."""
-    assert '100 %' in run(told, *TWO_HOURS, '--robot', 'thor', '--topic', '/scan').stdout
-    assert 'Nothing is known' in run(told, *TWO_HOURS, '--robot', 'tachi').stdout
-    assert run(told, 'coverage', '--since', '2026-10-28', '--until', '2026-10-27').exit_code == 2
-    assert run(told, 'coverage', '--since', '1971-01-01').exit_code == 2
+def test_coverage_without_gap_reports_is_unknown(gaps: Path) -> None:
+    """A topic without reports is 100 % unknown; an invalid range is wrong usage."""
+    assert '100 %' in run(gaps, *TWO_HOURS, '--robot', 'thor', '--topic', '/scan').stdout
+    assert 'Nothing is known' in run(gaps, *TWO_HOURS, '--robot', 'tachi').stdout
+    assert run(gaps, 'coverage', '--since', '2026-10-28', '--until', '2026-10-27').exit_code == 2
+    assert run(gaps, 'coverage', '--since', '1971-01-01').exit_code == 2

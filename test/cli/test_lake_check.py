@@ -1,4 +1,4 @@
-"""``shadowhound-data lake verify``: what it says of a store that lost something, and its exit codes."""
+"""``shadowhound-data lake verify``: its reports on a store that lost objects, and its exit codes."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def run(home: Path, *arguments: str) -> Result:
 
 def as_json(home: Path, *arguments: str) -> dict[str, Any]:
     answer = run(home, *arguments, '--json')
-    said: dict[str, Any] = json.loads(answer.stdout)
-    assert answer.return_value == (0 if said['ok'] else 1)
-    return said
+    report: dict[str, Any] = json.loads(answer.stdout)
+    assert answer.return_value == (0 if report['ok'] else 1)
+    return report
 
 
-def found(said: dict[str, Any]) -> dict[str, list[str]]:
-    return {kind: [one['key'] for one in piled['first']] for kind, piled in said['findings'].items()}
+def found(report: dict[str, Any]) -> dict[str, list[str]]:
+    return {kind: [one['key'] for one in group['first']] for kind, group in report['findings'].items()}
 
 
 def file(home: Path, key: str) -> Path:
@@ -66,7 +66,7 @@ def file(home: Path, key: str) -> Path:
 
 @pytest.mark.parametrize('deep', [[], ['--deep']])
 def test_a_complete_store_has_no_finding(home: Path, deep: list[str]) -> None:
-    """Exit code 0; every bucket is asked, and of what has no checksum in the catalog it says so."""
+    """Exit code 0; every bucket is checked, and objects without a checksum in the catalog are counted."""
     answer = run(home, *deep)
     assert answer.return_value == 0
     assert 'checked for 11 of the 11 objects of its own catalog' in answer.stdout
@@ -76,7 +76,7 @@ def test_a_complete_store_has_no_finding(home: Path, deep: list[str]) -> None:
 
 
 def test_each_loss_is_named(home: Path) -> None:
-    """Deleted, cut, changed; what has the right size and metadata is found by reading it."""
+    """Deleted, truncated or changed; a change that keeps size and metadata is found by reading the object."""
     gone, cut, changed, foreign = KEYS[:4]
     file(home, gone).unlink()
     file(home, cut).write_bytes(b'cut')
@@ -90,7 +90,7 @@ def test_each_loss_is_named(home: Path) -> None:
 
 
 def test_all_keys_are_in_the_json(home: Path) -> None:
-    """The text has the first of them."""
+    """The text lists only the first ones."""
     with closing(open_store(folder_store(home), UploadSettings())) as store:
         lost = [row('camera', NOON_NS + (60 + number) * SECOND) for number in range(50)]
         add_part(store, lost, 'lost', home / 'tmp')
@@ -99,7 +99,7 @@ def test_all_keys_are_in_the_json(home: Path) -> None:
 
 
 def test_the_catalog_of_another_store_counts_as_well(home: Path, tmp_path: Path) -> None:
-    """What the store lost of its own catalog, and the objects that were in it, are found by that alone."""
+    """A copy of the catalog from another store shows which rows, and which of their objects, the store lost."""
     old = tmp_path / 'old'
     shutil.copytree(file(home, 'thor/_catalog'), old / 'thor' / '_catalog')
     assert as_json(home, '--catalog', str(old))['ok']
@@ -109,9 +109,9 @@ def test_the_catalog_of_another_store_counts_as_well(home: Path, tmp_path: Path)
     file(home, cameras[0]).unlink()
     own = as_json(home)
     assert (own['ok'], own['asked']) == (True, 6)
-    said = as_json(home, '--catalog', str(old))
-    assert said['asked'] == 11
-    assert found(said) == {'missing': [cameras[0]], 'unlisted': cameras}
+    report = as_json(home, '--catalog', str(old))
+    assert report['asked'] == 11
+    assert found(report) == {'missing': [cameras[0]], 'unlisted': cameras}
     text = run(home, '--catalog', str(old)).stdout
     assert '5 are not as the catalog says' in text
     assert 'lake reindex' in text
@@ -121,21 +121,21 @@ def test_the_catalog_of_another_store_counts_as_well(home: Path, tmp_path: Path)
     (['--sensor', 'camra'], "is it 'camera'?"), (['--robot', 'thro'], "is it 'thor'?"),
 ])  # fmt: skip
 def test_a_name_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str], remedy: str) -> None:
-    """Instead of nothing verified; the nearest names are suggested."""
+    """It does not count as an empty selection; the nearest names are suggested."""
     found = run(home, *arguments)
     assert isinstance(found.exception, BadUsage)
     assert found.exception.remedy == remedy
 
 
 def test_an_empty_selection_is_not_a_success(home: Path) -> None:
-    """A catalog that is lost says nothing."""
+    """A missing catalog proves nothing."""
     answer = run(home, '--sensor', 'lidar')
     assert answer.return_value == 1
     assert 'Nothing is verified' in answer.stdout
 
 
 def test_an_interrupted_run_resumes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what was not asked yet and what was wrong, also after a kill that cut off its notes; a run that ended starts anew."""
+    """It checks the rest and keeps its findings, even if a kill truncated its notes; after a complete run it starts over."""
     file(home, KEYS[0]).unlink()
     answered: list[Any] = []
 
@@ -155,15 +155,15 @@ def test_an_interrupted_run_resumes(home: Path, monkeypatch: pytest.MonkeyPatch)
     with notes.open('ab') as torn:
         torn.write(b'half')
     assert as_json(home, '--sensor', 'camera')['asked'] == 5  # another question
-    said = as_json(home)
-    assert (said['asked'], said['asked_earlier'], said['sound']) == (7, 4, 10)
-    assert found(said) == {'missing': KEYS[:1]}
+    report = as_json(home)
+    assert (report['asked'], report['asked_earlier'], report['sound']) == (7, 4, 10)
+    assert found(report) == {'missing': KEYS[:1]}
     assert list((home / 'verify').iterdir()) == []
     assert as_json(home)['asked'] == 11
 
 
 def test_only_one_process_verifies_the_same_selection(home: Path, tmp_path: Path) -> None:
-    """The other is told so; a home that cannot be written is verified all the same; what was found long ago is forgotten."""
+    """A second one gets an error; old notes are deleted; a home that is read-only is verified anyway."""
     with AuditProgress(tmp_path / 'verify', 'x'):
         with pytest.raises(StoreError, match='another process'), AuditProgress(tmp_path / 'verify', 'x'):
             pass
@@ -177,6 +177,6 @@ def test_only_one_process_verifies_the_same_selection(home: Path, tmp_path: Path
 
 
 def test_wrong_usage_is_refused(home: Path) -> None:
-    """A folder without a catalog, a question that a catalog alone cannot answer, a time that is none."""
+    """A folder without a catalog, a filter that needs the store's tables, an invalid time."""
     for wrong in (['--catalog', str(home / 'tmp')], ['--catalog', str(home), '--failed'], ['--since', 'soon']):
         assert isinstance(run(home, *wrong).exception, click.UsageError)

@@ -69,7 +69,7 @@ def shown(found: dict[str, Any], width: int = 80, *, terminal: bool = False) -> 
 
 
 def test_the_default_topics_fit_into_80_columns() -> None:
-    """Without a terminal no line is longer than 80, no topic is cut, and nothing is abbreviated."""
+    """Without a terminal no line is longer than 80 characters, and nothing is cut or abbreviated."""
     text = shown(a_ledger(camera__camera_info=a_topic(published=1_234_567, received=1_234_567), point_cloud2=a_topic()))
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
     assert '/camera/camera_info  1,234,567  1,234,567' in text
@@ -77,7 +77,7 @@ def test_the_default_topics_fit_into_80_columns() -> None:
 
 
 def test_the_robot_is_the_one_whose_node_ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node in a namespace has its name in the spool: the ledger is of that robot, unless the environment names another."""
+    """The spool contains the name of a node in a namespace; the environment can name another robot."""
     monkeypatch.delenv('SHADOWHOUND_ROBOT', raising=False)
     spool = new_spool(tmp_path)
     spool.open()
@@ -91,7 +91,7 @@ def test_the_robot_is_the_one_whose_node_ran(tmp_path: Path, monkeypatch: pytest
 
 
 def test_robots_that_share_a_spool_are_all_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ledger is of the whole spool: it is not called that of one of them."""
+    """The ledger covers the whole spool, so it names all of them."""
     monkeypatch.delenv('SHADOWHOUND_ROBOT', raising=False)
     spool = new_spool(tmp_path)
     spool.open()
@@ -103,7 +103,7 @@ def test_robots_that_share_a_spool_are_all_named(tmp_path: Path, monkeypatch: py
 
 
 def test_a_pipe_gets_complete_columns() -> None:
-    """What is wider than 80 columns is not wrapped where no terminal asks for it: one line a topic."""
+    """Without a terminal, rows wider than 80 columns are not wrapped: one line per topic."""
     losses = {'rejected': {'truncated': 1_000_000}, 'dropped': {'queue_full': 2_000_000}}
     name = 'tachi__front_camera__image_raw__compressed'
     text = shown(a_ledger(**{name: a_topic(published=10**9, received=10**9, open=1234, **losses)}))
@@ -122,13 +122,13 @@ def test_a_narrow_terminal_breaks_no_topic(width: int) -> None:
 
 
 def test_empty_columns_are_hidden() -> None:
-    """Rejected, dropped and open appear only where there is something in them."""
+    """The columns rejected, dropped and open appear only if they contain something."""
     assert not {'rejected', 'dropped', 'open'} & set(shown(a_ledger(imu=a_topic())).split())
     assert 'dropped' in shown(a_ledger(imu=a_topic(dropped={'queue_full': 1}))).split()
 
 
 def test_bags_have_a_separate_table() -> None:
-    """What was recorded into bags, and why not, stands beside what the sensors kept; without bags there is no such table."""
+    """It shows what was recorded into bags, and why messages were not; without bags there is no such table."""
     found = a_ledger(imu=a_topic())
     assert 'bags' not in shown(found)
     text = shown(found | {'bags': {'/imu': a_topic(skipped=0, dropped={'queue_full': 40}, stored=60)}})
@@ -137,14 +137,14 @@ def test_bags_have_a_separate_table() -> None:
 
 
 def test_causes_are_listed_by_topic() -> None:
-    """What was missed, rejected or dropped is said with its causes, the largest first."""
+    """Missed, rejected and dropped messages are listed with their causes, the most frequent first."""
     text = shown(a_ledger(imu=a_topic(missed=15, missed_by={'transport': 3, 'restart': 12}), odom=a_topic()))
     assert '/imu: missed by restart 12, transport 3' in text
     assert '/odom:' not in text
 
 
 def test_other_types_of_a_topic_are_reported() -> None:
-    """By whom, and how many messages were refused, or that nobody knows."""
+    """With the publishers and the number of rejected messages, or that it is unknown."""
     others = {'a/msg/A': {'publishers': ['/x'], 'messages': 1234}, 'b/msg/B': {'publishers': [], 'messages': None}}
     text = shown(a_ledger(odom=a_topic(other_types=others)), 200)
     assert '/odom: published as a/msg/A too, by /x; of that 1,234 messages were rejected (wrong_type)' in text
@@ -152,13 +152,13 @@ def test_other_types_of_a_topic_are_reported() -> None:
 
 
 def test_messages_dated_by_arrival_are_reported() -> None:
-    """How many of which topic, by the reason why their own time was not trusted."""
+    """How many of each topic, with the reason why their own time was not trusted."""
     text = shown(a_ledger(odom=a_topic(by_arrival={'sent_ahead': 3, 'stamp_too_old': 1200})), 200)
     assert '/odom: dated by arrival, not by the message: stamp_too_old 1,200, sent_ahead 3' in text
 
 
 def test_a_clock_that_is_off_is_named() -> None:
-    """The ledger says so of the topic, with the likely cause."""
+    """The topic's line contains the offset and the likely cause."""
     stamps = {'publisher': 'p', 'state': 'offset', 'offset_s': -3600.0, 'spread_s': 0.1, 'since_ns': 0, 'cause': 'clock'}
     text = shown(a_ledger(odom=a_topic(stamps=stamps)), 300)
     assert '/odom: stamps are 3,600.0 s newer than their arrival since 1970-01-01' in text
@@ -166,13 +166,13 @@ def test_a_clock_that_is_off_is_named() -> None:
 
 
 def test_undelivered_messages_are_reported() -> None:
-    """Stored messages whose objects are elsewhere than in the store are named with where they are."""
+    """Stored messages whose objects are not in the store yet are listed with their state."""
     text = shown(a_ledger(imu=a_topic(stored_in=dict.fromkeys(STATES, 0) | {'delivered': 50, 'pending': 10})))
     assert '/imu: of 60 stored, pending 10' in text
 
 
 def test_accounting_is_mentioned_only_where_it_is_not_exact() -> None:
-    """Unknown figures are dashes, never 0, and a line says why; the total of a column with one is unknown too."""
+    """Unknown values are dashes, never 0, and a line explains why; the total of such a column is unknown too."""
     text = shown(a_ledger(imu=a_topic(accounting='received-only', published=None, missed=None), odom=a_topic()))
     assert '/imu: its messages carry no numbers' in text
     assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:5] == ['received-only', '-', '100', '-']
@@ -187,7 +187,7 @@ ABOUT: dict[str, Any] = {
 
 
 def test_estimates_are_marked_everywhere() -> None:
-    """In the row of the topic, in the total, and with its causes."""
+    """In the topic's row, in the total, and in the causes."""
     text = shown(a_ledger(imu=a_topic(**ABOUT), odom=a_topic()))
     assert next(line for line in text.splitlines() if line.startswith('/imu')).split()[1:5] == ['estimated', '~123', '100', '~23']
     assert next(line for line in text.splitlines() if line.startswith('all')).split()[1:4] == ['~223', '200', '~23']
@@ -195,7 +195,7 @@ def test_estimates_are_marked_everywhere() -> None:
 
 
 def test_several_grades_have_a_line_each() -> None:
-    """The topic has its present grade, and what is known of each."""
+    """The topic's row has its current grade; below it, each grade has its own counts."""
     parts = a_topic(received=40, published=45, missed=5)['by_grade'] | a_topic(**ABOUT)['by_grade']
     text = shown(a_ledger(imu=a_topic(received=140, published=None, missed=None, by_grade=parts)))
     lines = [line.split() for line in text.splitlines()]
@@ -214,7 +214,7 @@ def test_several_grades_have_a_line_each() -> None:
     ],
 )
 def test_no_sentence_claims_more_than_the_grades(rows: list[dict[str, Any]], words: str) -> None:
-    """That every message is accounted for is said of exact accounting alone."""
+    """Only exact accounting claims that every message is accounted for."""
     text = shown(a_ledger(**{f't{number}': a_topic(**row) for number, row in enumerate(rows)}), 200)
     assert words in text
     assert ('balances: every message is stored' in text) == (rows == [{}])
@@ -225,7 +225,7 @@ def test_no_sentence_claims_more_than_the_grades(rows: list[dict[str, Any]], wor
     {'topics': {'odom': {'other_types': {'x/msg/Y': {'messages': None, 'publishers': ['/a']}}}}},
 ])  # fmt: skip
 def test_the_verdict_is_about_what_was_received_where_something_is_not_logged(unknown: dict[str, Any]) -> None:
-    """And what that is, is listed above it."""
+    """Unlogged messages are listed above it."""
     found = a_ledger(odom=a_topic(**unknown.get('topics', {}).get('odom', {})))
     text = shown({**found, 'not_logged': unknown.get('not_logged', {})}, 200)
     assert 'balances: every message that was received is stored, skipped, or listed as lost; what is not logged is listed' in text
@@ -233,7 +233,7 @@ def test_the_verdict_is_about_what_was_received_where_something_is_not_logged(un
 
 
 def test_topics_without_messages_are_listed_below_the_table() -> None:
-    """It is named below the table."""
+    """They have no row in the table."""
     never = a_topic(accounting=None, received=0, published=None, missed=None, stored=0, skipped=0, by_grade={})
     text = shown(a_ledger(imu=never, odom=a_topic()))
     assert not any(line.startswith('/imu') for line in text.splitlines())
@@ -241,21 +241,21 @@ def test_topics_without_messages_are_listed_below_the_table() -> None:
 
 
 def test_an_imbalance_is_named() -> None:
-    """The verdict names each identity that does not hold."""
+    """The verdict names each sum that does not add up."""
     text = shown(a_ledger(balanced=False, imu=a_topic(stored=59)))
     assert 'The ledger balances' not in text
     assert 'Does not balance: /imu: received 100' in text
 
 
 def test_a_spool_without_messages_is_no_error() -> None:
-    """A node that has heard nothing yet has a ledger that balances."""
+    """A node that has not received anything yet has a ledger that balances."""
     text = shown(a_ledger())
     assert 'No message of thor has been received yet.' in text
     assert 'The ledger balances' in text
 
 
 def test_the_command_reads_a_spool_in_use(tmp_path: Path) -> None:
-    """While another holds the spool open: exit code 0, and --json has the same figures as the text."""
+    """While another process has the spool open: exit code 0, and --json has the same counts as the text."""
     spool = new_spool(tmp_path / 'spool')
     spool.open()
     try:
@@ -274,7 +274,7 @@ def test_the_command_reads_a_spool_in_use(tmp_path: Path) -> None:
 
 
 def test_no_spool_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder without a spool ends with exit code 1, a line that names it, and one with a remedy."""
+    """Exit code 1, one line that names the folder, and one with a remedy."""
     monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'ledger', '--spool', str(tmp_path / 'none')])
     with pytest.raises(SystemExit) as caught:
         main()
@@ -300,7 +300,7 @@ def test_no_spool_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     ],
 )
 def test_clock_steps_are_reported(clock: dict[str, Any], words: list[str]) -> None:
-    """Only where somebody who reads dates should know."""
+    """Only if they affect dates."""
     text = ' '.join(shown({**a_ledger(), 'clock': clock}).split())
     for part in words:
         assert part in text
@@ -371,14 +371,14 @@ def test_gaps_have_time_duration_count_and_cause(tmp_path: Path) -> None:
     ],
 )
 def test_gaps_can_be_filtered_by_topic_time_and_cause(tmp_path: Path, options: list[str], causes: list[str]) -> None:
-    """What has no time is left out once one is asked for."""
+    """With --since or --until, gaps without a time are skipped."""
     lossy(tmp_path / 'spool')
     _, rows = gaps(tmp_path / 'spool', *options)
     assert sorted(row['cause'] for row in rows) == sorted(causes)
 
 
 def test_questions_about_gaps_need_gaps(tmp_path: Path) -> None:
-    """An option that would do nothing is refused."""
+    """An option that would have no effect is rejected."""
     found = CliRunner().invoke(ledger, ['--topic', '/camera', '--spool', str(tmp_path)])
     assert found.exit_code == 2
     assert 'choose among gaps' in found.output
@@ -399,7 +399,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for item in items[:3]:
         store.put(item)
         settle(spool, item, State.DELIVERED)
-    abandon(spool)  # without its end, as when it runs
+    abandon(spool)  # without closing it, as while the node runs
     return tmp_path
 
 
@@ -409,14 +409,14 @@ def run(*arguments: str) -> Result:
 
 def as_json(*arguments: str) -> dict[str, Any]:
     answer = run(*arguments, '--json')
-    said: dict[str, Any] = json.loads(answer.stdout)
-    assert answer.return_value == (0 if said['ok'] else 1)
-    return said
+    report: dict[str, Any] = json.loads(answer.stdout)
+    assert answer.return_value == (0 if report['ok'] else 1)
+    return report
 
 
 @pytest.mark.parametrize('option', ['--verify', '--deep'])
 def test_verify_finds_a_complete_store(home: Path, option: str) -> None:
-    """Exit code 0, how many were asked for, where, and since when they are remembered."""
+    """Exit code 0; the text has the number of objects, the store, and since when objects are remembered."""
     answer = run(option)
     assert answer.return_value == 0
     text = ' '.join(answer.stdout.split())
@@ -426,36 +426,36 @@ def test_verify_finds_a_complete_store(home: Path, option: str) -> None:
 
 
 def test_verify_lists_missing_objects(home: Path) -> None:
-    """Exit code 1, each kind with its keys, and the same as JSON."""
+    """Exit code 1; each kind of finding is listed with its keys, in the text and as JSON."""
     (home / 'store/sensor-data/thor/a').unlink()
     (home / 'store/sensor-data/thor/b').write_bytes(b'longer')
     text = run('--verify')
     assert text.return_value == 1
     assert 'sensor-data/thor/a: 1 bytes were delivered' in text.stdout
     assert '2 are not what was delivered' in text.stdout
-    said = as_json('--verify')
-    assert {kind: [one['key'] for one in piled['first']] for kind, piled in said['findings'].items()} == {
+    report = as_json('--verify')
+    assert {kind: [one['key'] for one in group['first']] for kind, group in report['findings'].items()} == {
         'missing': ['thor/a'], 'size': ['thor/b'],
     }  # fmt: skip
-    assert (said['asked'], said['sound'], said['known'], said['forgotten']) == (3, 1, 3, 0)
+    assert (report['asked'], report['sound'], report['known'], report['forgotten']) == (3, 1, 3, 0)
 
 
 def test_verify_names_a_store_that_is_not_the_nodes(home: Path) -> None:
-    """Where objects are missing and the node named another store, the report says so; where it named this one, not."""
+    """If objects are missing and the node delivered to another store, the report names that store."""
     status = home / 'spool' / 'status-thor.json'
     for path in (home / 'store').rglob('*'):
         if path.is_file():
             path.unlink()
-    for target, is_told in (('the S3 server at http://10.0.0.5:9000', True), (f'the folder {home}/store', False)):
+    for target, is_other in (('the S3 server at http://10.0.0.5:9000', True), (f'the folder {home}/store', False)):
         status.write_text(json.dumps({'robot': 'thor', 'store': {'target': target}}))
         text = ' '.join(run('--verify').stdout.split())
         assert '3 not in the store' in text
-        assert (f'But the node delivered to {target}: is AWS_ENDPOINT_URL set here' in text) is is_told
+        assert (f'But the node delivered to {target}: is AWS_ENDPOINT_URL set here' in text) is is_other
         assert as_json('--verify')['delivered_to'] == [target]
 
 
 def test_forgotten_objects_are_reported(home: Path) -> None:
-    """The report says how many it cannot ask for."""
+    """The report counts the delivered objects that the index no longer contains."""
     with closing(sqlite3.connect(home / 'spool/index.db')) as index:
         index.execute("DELETE FROM objects WHERE key = 'thor/a'")
         index.commit()
@@ -463,16 +463,16 @@ def test_forgotten_objects_are_reported(home: Path) -> None:
 
 
 def test_the_catalog_is_not_called_forgotten(home: Path) -> None:
-    """Its parts are not asked for, others stand for them in time; but they are not objects that the index forgot."""
+    """Parts of the catalog are not checked, as later ones replace them, but they do not count as forgotten."""
     with closing(sqlite3.connect(home / 'spool/index.db')) as index:
         index.execute("UPDATE objects SET sensor = '_catalog' WHERE key = 'thor/a'")
         index.commit()
-    said = as_json('--verify')
-    assert (said['known'], said['forgotten']) == (2, 0)
+    report = as_json('--verify')
+    assert (report['known'], report['forgotten']) == (2, 0)
 
 
 def test_an_unreachable_store_is_an_error_and_not_a_loss(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exit code 1, no object is called missing, how far it came, and no secret; then the folder is another store."""
+    """Exit code 1 and the number of unchecked objects; none is called missing, and no secret is printed."""
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', SECRET)
@@ -483,14 +483,14 @@ def test_an_unreachable_store_is_an_error_and_not_a_loss(home: Path, monkeypatch
     assert 'The store cannot be reached' in text
     assert '3 objects are not checked yet' in text
     assert SECRET not in text
-    said = as_json('--deep')
-    assert (said['findings'], said['asked'], bool(said['unreachable'])) == ({}, 0, True)
+    report = as_json('--deep')
+    assert (report['findings'], report['asked'], bool(report['unreachable'])) == ({}, 0, True)
     monkeypatch.delenv('AWS_ENDPOINT_URL')
     assert as_json('--verify')['asked'] == 3
 
 
 def test_an_interrupted_run_resumes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an earlier run found sound is not asked for again, unless that is asked for."""
+    """Objects that an earlier run found intact are not checked again, except with --again."""
     heads = DirectoryStore.head
 
     def interrupted(self: DirectoryStore, bucket: str, key: str) -> Any:
@@ -503,8 +503,8 @@ def test_an_interrupted_run_resumes(home: Path, monkeypatch: pytest.MonkeyPatch)
             patched.setattr(DirectoryStore, 'head', interrupted)
             with pytest.raises(click.Abort):
                 CliRunner().invoke(ledger, ['--verify'], standalone_mode=False, catch_exceptions=False)
-        said = as_json('--verify', option)
-        assert (said['asked'], said['asked_earlier'], said['sound']) == (asked, 3 - asked, 3)
+        report = as_json('--verify', option)
+        assert (report['asked'], report['asked_earlier'], report['sound']) == (asked, 3 - asked, 3)
 
 
 @pytest.mark.parametrize(('arguments', 'code', 'words'), [
@@ -514,7 +514,7 @@ def test_an_interrupted_run_resumes(home: Path, monkeypatch: pytest.MonkeyPatch)
 def test_wrong_usage_is_refused(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, words: str
 ) -> None:
-    """Code 2 for options that do not fit, 1 for a spool that is not there."""
+    """Exit code 2 for options that exclude each other, 1 for a spool that does not exist."""
     monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'ledger', *arguments])
     with pytest.raises(SystemExit) as caught:
         main()
@@ -523,6 +523,6 @@ def test_wrong_usage_is_refused(
 
 
 def test_a_copied_spool_is_verified_like_the_original(home: Path) -> None:
-    """A spool that was copied is verified as the one it was."""
+    """The copy refers to the same store."""
     shutil.copytree(home / 'spool', home / 'rescued')
     assert as_json('--verify', '--spool', str(home / 'rescued'))['asked'] == 3

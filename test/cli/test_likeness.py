@@ -24,7 +24,7 @@ from shadowhound_data_logger.stores import open_store
 
 @pytest.fixture(scope='module')
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A red and a blue picture, and one that is none."""
+    """A red and a blue image, and an invalid one."""
     home = tmp_path_factory.mktemp('home')
     make_pair(home / 'colors')
     with closing(open_store(folder_store(home), UploadSettings())) as store:
@@ -35,9 +35,9 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
             if color == 'red':
                 (home / 'red.png').write_bytes(out.getvalue())
             body = out.getvalue()
-            told = {**row('camera', NOON_NS + place * SECOND), 'bytes': len(body), 'sha256': hashlib.sha256(body).hexdigest()}
-            add(store, home / 'tmp', str(told['key']), body)
-            add_part(store, [told], str(place), home / 'tmp')
+            entry = {**row('camera', NOON_NS + place * SECOND), 'bytes': len(body), 'sha256': hashlib.sha256(body).hexdigest()}
+            add(store, home / 'tmp', str(entry['key']), body)
+            add_part(store, [entry], str(place), home / 'tmp')
     return home
 
 
@@ -55,8 +55,8 @@ def test_similar_images_are_found_after_embedding(home: Path) -> None:
     assert made.return_value == ExitCode.FINDING
     assert '2 vectors made by the model colors' in made.output
     assert '1 picture without one: no JPEG, PNG or TIFF' in made.output
-    told = json.loads(run(home, 'embed', '--model', str(home / 'colors'), '--json').stdout)
-    assert (told['pictures'], told['known'], told['made'], told['refused']) == (3, 2, 0, {'unreadable': 1})
+    report = json.loads(run(home, 'embed', '--model', str(home / 'colors'), '--json').stdout)
+    assert (report['pictures'], report['known'], report['made'], report['refused']) == (3, 2, 0, {'unreadable': 1})
     for question in (['--like', str(home / 'red.png')], ['--like-text', 'red']):
         found = run(home, 'query', *question, '--model', str(home / 'colors'), '--limit', '1', '--format', 'keys')
         assert 'sensor-data/thor/camera/20261028/120000_x.jpg' in found.output

@@ -1,4 +1,4 @@
-"""What ``shadowhound-data live`` decides before it serves: whose page it is, and which URLs it takes."""
+"""What ``shadowhound-data live`` decides before it serves: the kind of page, and which URLs are valid."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ TILES = 'https://tile.example/{z}/{x}/{y}.png'
 
 @pytest.mark.parametrize('tiles', ['https://tile.example/', 'file:///{z}/{x}/{y}', "https://a b;'x/{z}/{x}/{y}", '{z}{x}{y}'])
 def test_tiles_are_a_url_with_places(tmp_path: Path, tiles: str) -> None:
-    """Nothing else gets into the policy of the page."""
+    """Other text must not get into the page's content security policy."""
     check_urls(tmp_path / 'none', None, None, TILES, None)
     with pytest.raises(BadUsage, match='--tiles'):
         check_urls(tmp_path / 'none', None, None, tiles, None)
 
 
 def test_a_relayed_robot_is_on_another_machine(tmp_path: Path) -> None:
-    """Not where a spool is; and it has no cameras to serve."""
+    """Its page needs a folder without a spool, a complete URL, and serves no cameras over RTSP."""
     check_urls(tmp_path / 'none', 'http://thor:8765/', None, '', None)
     for folder, url, rtsp in (
         (tmp_path, 'http://thor:8765/', None),
@@ -34,7 +34,7 @@ def test_a_relayed_robot_is_on_another_machine(tmp_path: Path) -> None:
 
 
 def test_the_kind_of_page_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A store's where no node has run, unless something says that this is a robot; a robot's as soon as one has."""
+    """The store's page if no node has run and nothing names a robot; otherwise the robot's."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     for name in ('AWS_ENDPOINT_URL', 'SHADOWHOUND_ROBOT'):
         monkeypatch.delenv(name, raising=False)

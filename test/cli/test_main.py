@@ -38,7 +38,7 @@ from shadowhound_data_logger.doctor.context import make
 
 
 def verbs(command: click.Command = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
-    """All there are, with the verbs of verbs."""
+    """All commands with their full names, subcommands included."""
     yield ' '.join(path), command
     if isinstance(command, click.Group):
         for name, each in command.commands.items():
@@ -57,12 +57,12 @@ def help_of(name: str, width: int = 80) -> str:
 
 
 def examples_of(name: str) -> list[str]:
-    """As the help shows them: one line each, however narrow the terminal."""
+    """The examples in the help, which are one line each even in a narrow terminal."""
     return re.findall(rf'^ +({PROGRAM} .*)$', help_of(name, 40).partition('Examples:')[2], re.MULTILINE)
 
 
 def parsed(arguments: Sequence[str]) -> tuple[click.Command, click.Context]:
-    """The verb of a command line, once every option is one of it and has a value of its type, and nothing is missing."""
+    """The verb of a command line, after checking that its options exist and are valid, and that none is missing."""
     command, context, rest = cli, click.Context(cli, info_name=PROGRAM), list(arguments)
     while True:
         given, rest, order = command.make_parser(context).parse_args(args=rest)
@@ -83,7 +83,7 @@ def parsed(arguments: Sequence[str]) -> tuple[click.Command, click.Context]:
 
 @pytest.mark.parametrize('name', VERBS)
 def test_every_verb_has_examples_that_parse(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each is of this verb, or of one of its own; no option in it is unknown, without its value, or missing."""
+    """Each example calls this verb or a subcommand, and no option in it is unknown, missing or without its value."""
     monkeypatch.chdir(tmp_path)
     for folder in ('packed', 'outputs/go2_patrol', 'clip-vit-base-patch32', 'usb', 'examples'):  # which some examples read
         (tmp_path / folder).mkdir(parents=True)
@@ -103,14 +103,14 @@ def test_every_verb_has_examples_that_parse(name: str, tmp_path: Path, monkeypat
 
 
 def test_an_example_with_a_wrong_option_would_be_found() -> None:
-    """The parser above is not a rubber stamp."""
+    """``parsed`` rejects wrong command lines."""
     for wrong in ('bag fetch x', 'bag fetch --to y', 'bag list --sinc yesterday', 'missions export x --format xml', 'bag lst'):
         with pytest.raises((click.UsageError, AssertionError)):
             parsed(wrong.split())
 
 
 def test_the_verbs_are_in_sections() -> None:
-    """Each in one of them, by its own help, and in full: no line of the list is cut."""
+    """Each verb is in one section with its own help, and no line is cut."""
     listed = [verb for section in SECTIONS.values() for verb in section]
     assert sorted(verb.name for verb in listed) == sorted(cli.commands)
     assert [verb.load().get_short_help_str(1000) for verb in listed] == [verb.help for verb in listed]
@@ -123,7 +123,7 @@ def test_the_verbs_are_in_sections() -> None:
 
 @pytest.mark.parametrize('name', LEAVES)
 def test_every_verb_ends_with_a_code_of_the_table(name: str) -> None:
-    """It returns an ExitCode, which mypy checks."""
+    """Each is annotated with ExitCode, which mypy checks."""
     callback = LEAVES[name].callback
     assert callback is not None
     assert callback.__annotations__['return'] in {'ExitCode', 'Any'}  # what ``question`` wraps has its own annotation below
@@ -141,7 +141,7 @@ def test_every_verb_answers_in_json(name: str) -> None:
 
 
 def classes(base: type[Exception] = DataLoggerError) -> Iterator[type[Exception]]:
-    """All but those that never leave their module, of the node's modules only those that another test has imported already."""
+    """All public error classes."""
     for each in pkgutil.walk_packages(shadowhound_data_logger.__path__, 'shadowhound_data_logger.'):
         if each.name.rpartition('.')[2] not in {'main', '__main__'} and '.capture.' not in each.name:
             importlib.import_module(each.name)
@@ -176,7 +176,7 @@ def made(kind: type[Exception]) -> Exception:
 
 
 def test_every_class_of_errors_has_a_remedy(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """In two lines: the verb, what and where; what to do. A command in it is one."""
+    """Errors have two lines: verb and message, then the remedy; commands in remedies exist."""
     kinds = [*classes(), OSError, PermissionError, sqlite3.OperationalError, sqlite3.DatabaseError]
     assert len(kinds) > 25
     for kind in kinds:
@@ -196,7 +196,7 @@ def test_every_class_of_errors_has_a_remedy(monkeypatch: pytest.MonkeyPatch, cap
 
 
 def test_a_specific_remedy_takes_precedence() -> None:
-    """That of its class is for those without."""
+    """The remedy of the class is only the default."""
     error = BagError('no bag x', remedy='look again')
     assert described(error, ['bag', 'info', 'x']) == (f'{PROGRAM} bag info', 'no bag x', 'look again')
     missing = FileNotFoundError(2, 'No such file or directory', '/nowhere')
@@ -225,7 +225,7 @@ def test_a_specific_remedy_takes_precedence() -> None:
 ])  # fmt: skip
 def test_an_error_has_a_message_and_a_remedy(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
                                            arguments: list[str], code: ExitCode, what: str, remedy: str) -> None:  # fmt: skip
-    """As somebody makes them: the verb and what is wrong, then what to do; wrong usage is 2, the rest 1."""
+    """For mistakes that users make: the verb and what is wrong, then the remedy; exit code 2 for wrong usage, otherwise 1."""
     assert home.is_dir()
     found, lines = ended(monkeypatch, capsys, *arguments)
     assert found == code
@@ -244,23 +244,23 @@ def test_an_error_has_a_message_and_a_remedy(home: Path, monkeypatch: pytest.Mon
 def test_an_error_is_json_where_the_answer_would_be(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], code: ExitCode
 ) -> None:
-    """One line on standard error, of one shape, with the exit code; nothing on standard output."""
+    """With --json an error is one JSON object on standard error, with the exit code."""
     assert home.is_dir()
     found, lines = ended(monkeypatch, capsys, *arguments)
     assert found == code
     (line,) = lines
-    told = json.loads(line)
-    assert set(told) == {'error', 'remedy', 'verb', 'exit_code'}
-    assert all(told.values())
-    assert told['exit_code'] == code
-    assert told['verb'].startswith(f'{PROGRAM} {arguments[0]}')
+    report = json.loads(line)
+    assert set(report) == {'error', 'remedy', 'verb', 'exit_code'}
+    assert all(report.values())
+    assert report['exit_code'] == code
+    assert report['verb'].startswith(f'{PROGRAM} {arguments[0]}')
 
 
 @pytest.mark.parametrize('arguments', [(), ('missions',), ('node', 'bag')])
 def test_a_group_without_a_verb_prints_its_help(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]
 ) -> None:
-    """It is no error with a remedy, but the help itself."""
+    """Not an error with a remedy."""
     code, lines = ended(monkeypatch, capsys, *arguments)
     assert code == ExitCode.USAGE
     assert lines[0].startswith(' '.join(('Usage:', PROGRAM, *arguments)))
@@ -271,7 +271,7 @@ def test_a_group_without_a_verb_prints_its_help(
 def test_an_invalid_environment_is_wrong_usage(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As with the node: a setting that is refused is 2."""
+    """As for the node: exit code 2 for an invalid setting."""
     assert home.is_dir()
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'tower:9000')
     code, lines = ended(monkeypatch, capsys, 'bag', 'list')
@@ -283,7 +283,7 @@ def test_an_invalid_environment_is_wrong_usage(
 def test_every_kind_of_error_has_its_exit_code(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, code: ExitCode
 ) -> None:
-    """Ctrl-C is 130, as for a shell."""
+    """Ctrl-C is 130, as in a shell."""
 
     def fail(*_: object, **__: object) -> None:
         raise error
@@ -293,7 +293,7 @@ def test_every_kind_of_error_has_its_exit_code(
 
 
 def printing(lines: int, **environ: str) -> list[str]:
-    """The command line of a verb that prints so many lines that no 8-bit encoding has, and one that no encoding has."""
+    """A command that prints lines with characters that 8-bit encodings, or all encodings, lack."""
     script = (
         'from shadowhound_data_logger.cli import main, output\n'
         'import click\n'
@@ -310,7 +310,7 @@ def printing(lines: int, **environ: str) -> list[str]:
 
 @pytest.mark.parametrize('encoding', ['ascii', 'latin-1', 'cp1252', 'utf-8', 'utf-8:strict'])
 def test_output_that_the_terminal_cannot_hold_is_escaped(encoding: str) -> None:
-    """What an encoding does not have becomes its escape, in the output and in errors; nothing ends in a traceback."""
+    """Characters that the encoding lacks are escaped; there is no traceback."""
     done = subprocess.run(printing(1, PYTHONIOENCODING=encoding, PYTHONUTF8='0'), capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b'')
     if encoding != 'ascii':  # click takes it for a mistake, and writes UTF-8
@@ -320,7 +320,7 @@ def test_output_that_the_terminal_cannot_hold_is_escaped(encoding: str) -> None:
 
 @pytest.mark.parametrize('lines', [1, 100_000])
 def test_a_closed_pipe_is_not_an_error(lines: int) -> None:
-    """``| head`` has enough: not a word on standard error, whether the rest was written meanwhile or is still in a buffer."""
+    """With ``| head`` nothing is printed on standard error, whether the rest was written already or is still buffered."""
     with subprocess.Popen(printing(lines), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -350,7 +350,7 @@ def test_a_query_of_a_folder_imports_no_s3_client() -> None:
 
 @pytest.fixture
 def spool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of a machine on which nothing says which robot it is."""
+    """The spool of a machine without any robot name."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     for name in ('SHADOWHOUND_ROBOT', 'AWS_ENDPOINT_URL'):
         monkeypatch.delenv(name, raising=False)
@@ -359,7 +359,7 @@ def spool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_verbs_use_the_robot_of_this_machine(spool: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The one whose node has run here; if there are several, they ask."""
+    """The robot whose node has run here; if there are several, an error asks for the name."""
     written(spool, robot='turtle')
     assert the_robot(None) == 'turtle'
     assert cli(['bag', 'list'], standalone_mode=False) == ExitCode.FINE
@@ -393,10 +393,10 @@ def test_a_verb_that_finds_no_robot_names_the_folder(
     monkeypatch.setattr(sys, 'argv', ['shadowhound-data', *arguments])
     with pytest.raises(SystemExit) as caught:
         main()
-    told = ' '.join(capsys.readouterr().err.split())
+    error = ' '.join(capsys.readouterr().err.split())
     assert caught.value.code == ExitCode.USAGE
-    assert f'no robot found: no node has run with the spool {spool}' in told
-    assert 'add --robot NAME, or set SHADOWHOUND_ROBOT' in told
+    assert f'no robot found: no node has run with the spool {spool}' in error
+    assert 'add --robot NAME, or set SHADOWHOUND_ROBOT' in error
     assert not list(spool.iterdir())
 
 
@@ -445,7 +445,7 @@ def shell(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.mark.usefixtures('shell')
 @pytest.mark.parametrize('how', [f'source {FILE}', CLICKS], ids=['file', 'line'])
 def test_verbs_options_and_choices_are_completed(how: str) -> None:
-    """As bash calls the function for each word before the cursor."""
+    """As bash calls the completion function."""
     script = (
         how
         + """
@@ -456,13 +456,13 @@ def test_verbs_options_and_choices_are_completed(how: str) -> None:
             echo "${COMPREPLY[@]}"
         done"""
     )
-    said = subprocess.run(['bash', '--norc', '-c', script], capture_output=True, text=True, check=True, timeout=250).stdout
-    assert said.splitlines() == ['ledger', 'verify', '--sensor', 'table csv json keys', 'start stop']
+    completed = subprocess.run(['bash', '--norc', '-c', script], capture_output=True, text=True, check=True, timeout=250).stdout
+    assert completed.splitlines() == ['ledger', 'verify', '--sensor', 'table csv json keys', 'start stop']
 
 
 @pytest.mark.usefixtures('shell')
 def test_a_terminal_completes_with_tab() -> None:
-    """In an interactive bash, up to the space behind the verb."""
+    """In an interactive bash."""
     process, terminal = pty.fork()
     if process == 0:
         os.execvp('bash', ['bash', '--norc', '--noprofile', '-i'])  # noqa: S606 - a bash that a person types into
@@ -482,7 +482,7 @@ def test_a_terminal_completes_with_tab() -> None:
 
 @pytest.mark.usefixtures('shell')
 def test_verbs_are_completed_without_importing_them() -> None:
-    """Each word would otherwise take as long as the slowest verb."""
+    """Otherwise each completion would take as long as the slowest import."""
     code = """import sys, click
 from shadowhound_data_logger.cli.main import cli
 print(*[each.value for each in cli.shell_complete(click.Context(cli), '')])

@@ -1,4 +1,4 @@
-"""``shadowhound-data missions`` on missions made here: what it says, its exit codes, and that it sends what is left."""
+"""``shadowhound-data missions``: output and exit codes, and sending records that were not sent yet."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fly(home: Path, mission_type: str = 'patrol') -> str:
 
 
 def see(home: Path, mission_id: str) -> None:
-    """What a node beside the agent logged."""
+    """Add what a node logs next to the agent."""
     node = MissionFolder(home / MISSIONS / mission_id).node
     node.files.mkdir(parents=True)
     writer = Journal(node.journal)
@@ -57,7 +57,7 @@ def deliver(home: Path, mission_id: str) -> None:
 
 
 def test_without_a_mission_the_searched_folder_is_named(tmp_path: Path) -> None:
-    """That is fine, and no error."""
+    """It is not an error."""
     found = run(tmp_path, 'list')
     assert found.return_value == 0
     assert f'No mission has been logged in {tmp_path / MISSIONS} yet' in found.output
@@ -65,7 +65,7 @@ def test_without_a_mission_the_searched_folder_is_named(tmp_path: Path) -> None:
 
 
 def test_the_list_shows_unsent_records(tmp_path: Path) -> None:
-    """A mission that is over and not sent is a finding; one that is sent, or active, is none."""
+    """For a finished mission that is not sent the exit code is 1; for a sent or active one it is 0."""
     mission_id = fly(tmp_path)
     found = run(tmp_path, 'list')
     assert found.return_value == 1
@@ -81,7 +81,7 @@ def test_the_list_shows_unsent_records(tmp_path: Path) -> None:
 
 
 def test_a_mission_being_sent_needs_no_resume(tmp_path: Path) -> None:
-    """While an agent's sender is at it the list says so, and asks for nothing."""
+    """While an agent's sender is running, the list shows that and suggests nothing."""
     fly(tmp_path)
     with flock(tmp_path / MISSIONS / LOCK):
         text = run(tmp_path, 'list').output
@@ -90,7 +90,7 @@ def test_a_mission_being_sent_needs_no_resume(tmp_path: Path) -> None:
 
 
 def test_the_list_does_not_read_sent_records(tmp_path: Path) -> None:
-    """A mission that is sent whole is told by its summary, in the same words as by its journal."""
+    """The brief of a completely sent mission comes from its summary and equals the one from its journal."""
     mission_id = fly(tmp_path)
     deliver(tmp_path, mission_id)
     (before,) = overviews(tmp_path)
@@ -103,14 +103,14 @@ def test_the_list_does_not_read_sent_records(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('which', ['mission', 'run', 'beginning'])
 def test_either_id_finds_a_mission(tmp_path: Path, which: str) -> None:
-    """Its own, that of its run, or how one of them begins."""
+    """The mission's id, that of its run, or a prefix of either."""
     mission_id = fly(tmp_path)
     fly(tmp_path, 'inspection')
     deliver(tmp_path, mission_id)
     found = run(tmp_path, 'show', '--json', {'mission': mission_id, 'run': 'run0', 'beginning': 'patrol_2'}[which])
     assert found.return_value == 0
-    said = json.loads(found.output)
-    assert (said['mission_id'], said['run_id'], said['complete']) == (mission_id, 'run0', True)
+    page = json.loads(found.output)
+    assert (page['mission_id'], page['run_id'], page['complete']) == (mission_id, 'run0', True)
 
 
 @pytest.mark.parametrize('wanted', ['nobody', '', 'p'])
@@ -129,7 +129,7 @@ def test_an_unknown_or_ambiguous_id_is_a_usage_error(
 
 
 def test_a_page_shows_why_a_record_is_unsent(tmp_path: Path) -> None:
-    """Parameters, last values, counts, and the last error with its remedy."""
+    """With parameters, last values, counts, and the last error with its remedy."""
     mission_id = fly(tmp_path)
     see(tmp_path, mission_id)
     error = TrackingUnavailable('Tower is away', remedy='is it on?')
@@ -149,24 +149,24 @@ def test_a_page_shows_why_a_record_is_unsent(tmp_path: Path) -> None:
 
 
 def test_an_export_has_all_that_was_logged(tmp_path: Path) -> None:
-    """Params, points of agent and node, events; the same as CSV, to a file if one is named."""
+    """Params, metrics of agent and node, and events, as JSON or as CSV in a file."""
     mission_id = fly(tmp_path)
     see(tmp_path, mission_id)
-    said = json.loads(run(tmp_path, 'export', mission_id).output)
-    assert json.loads(run(tmp_path, 'export', '--json', mission_id).output) == said
-    assert said['params']['mission_type'] == 'patrol'
-    points = {(point['key'], point['value'], point['step'], point['source']) for point in said['points']}
+    page = json.loads(run(tmp_path, 'export', mission_id).output)
+    assert json.loads(run(tmp_path, 'export', '--json', mission_id).output) == page
+    assert page['params']['mission_type'] == 'patrol'
+    points = {(point['key'], point['value'], point['step'], point['source']) for point in page['points']}
     assert {('people_met', 2.0, 3, 'agent'), ('battery_pct', 77.0, 1, 'node'), ('distance_m', 12.5, 0, 'agent')} <= points
-    assert [(event['name'], event['data']) for event in said['events']] == [('door', {'state': 'open'})]
+    assert [(event['name'], event['data']) for event in page['events']] == [('door', {'state': 'open'})]
     target = tmp_path / 'out.csv'
     assert run(tmp_path, 'export', '--format', 'csv', '--to', str(target), mission_id).return_value == 0
     rows = list(csv.DictReader(io.StringIO(target.read_text())))
-    assert len(rows) == len(said['params']) + len(said['points']) + len(said['events'])
+    assert len(rows) == len(page['params']) + len(page['points']) + len(page['events'])
     assert ('metric', 'people_met', '2.0', '3') in {(row['kind'], row['key'], row['value'], row['step']) for row in rows}
 
 
 def test_a_record_that_cannot_be_sent_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the deadline it says what is left, with exit code 1."""
+    """After the timeout the exit code is 1, and unsent missions are listed."""
     monkeypatch.setattr(Replayer, 'start', lambda _: None)
     mission_id = fly(tmp_path)
     found = run(tmp_path, 'resume', '--timeout', '0.3')
@@ -178,7 +178,7 @@ def test_a_record_that_cannot_be_sent_is_kept(tmp_path: Path, monkeypatch: pytes
 
 
 def test_unsent_records_are_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sender is started for it, and with nothing left nothing is."""
+    """``resume`` starts the sender only if there is something to send."""
     mission_id = fly(tmp_path)
     started: list[Replayer] = []
 

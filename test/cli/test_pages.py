@@ -33,18 +33,18 @@ PACKAGE = Path(__file__).parents[2] / 'shadowhound_data_logger'
 
 
 def test_the_generated_pages_are_up_to_date() -> None:
-    """Whoever changes a setting or a verb runs `make docs`."""
+    """A change of a setting or a verb needs `make docs`."""
     assert (DOCS / 'parameters.md').read_text(encoding='utf-8') == parameters()
     assert (DOCS / 'commands.md').read_text(encoding='utf-8') == commands()
 
 
 def test_the_exit_codes_are_in_one_table() -> None:
-    """That page has each with its meaning, and `--help` names them."""
-    told = CliRunner().invoke(cli, ['--help']).stdout
+    """The page and `--help` have each code with its meaning."""
+    named = CliRunner().invoke(cli, ['--help']).stdout
     assert set(MEANINGS) == set(ExitCode)
     for code, meaning in MEANINGS.items():
         assert f'| `{code.value}` | {meaning} |' in commands()
-        assert re.search(rf'^  {code.value} +{meaning}$', told, re.MULTILINE)
+        assert re.search(rf'^  {code.value} +{meaning}$', named, re.MULTILINE)
 
 
 def test_every_parameter_is_on_the_page() -> None:
@@ -94,7 +94,7 @@ def test_live_parameters_are_marked() -> None:
 
 
 def test_every_environment_variable_is_on_the_page() -> None:
-    """The page tells the variables that config.py reads, all of them and no others."""
+    """The page lists exactly the variables that config.py reads."""
     read = set(re.findall(r"environ\.get\('(\w+)'\)", (PACKAGE / 'core' / 'config.py').read_text(encoding='utf-8')))
     assert read == {name for name, _, _ in VARIABLES}
 
@@ -104,8 +104,8 @@ def test_every_variable_of_the_guide_is_on_the_page() -> None:
     names = r'\b(?:AWS|SHADOWHOUND|MLFLOW|ROS|RMW|REQUESTS|FAST(?:RTPS|DDS)|CYCLONEDDS)_[A-Z_]*[A-Z]\b'
     root = DOCS.parent
     files = (DOCS / 'thor.md', *(root / 'launch_configs').glob('*.service'))
-    told = {name for file in files for name in re.findall(names, file.read_text(encoding='utf-8'))}
-    assert {name for name in told if f'\n- `{name}`' not in parameters()} == {'ROS_DISTRO'} & told
+    named = {name for file in files for name in re.findall(names, file.read_text(encoding='utf-8'))}
+    assert {name for name in named if f'\n- `{name}`' not in parameters()} == {'ROS_DISTRO'} & named
 
 
 def test_every_table_is_complete() -> None:
@@ -121,18 +121,18 @@ def test_without_write_the_command_prints_the_pages() -> None:
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 COMMAND: Final = re.compile(r'shadowhound-data (?P<verb>[a-z]+)(?P<rest>[^`#|;)\n\']*)')
-"""As far as it is surely still the command: to the end of a code span, a comment, a pipe, a string or the line."""
+"""To the end of the code span, comment, string or line, or to a pipe."""
 SERVICE: Final = re.compile(r'service call (?:/\w+)?/sensor_logger_node/(?P<name>[\w/]+) std_srvs/srv/(?P<type>\w+)')
 PARAMETER: Final = re.compile(r'param set (?:/\w+)?/sensor_logger_node (?P<name>[\w.]+)')
 SERVICES: Final = {
     'flush': 'Trigger', 'pause': 'SetBool', 'bag/start': 'Trigger', 'bag/stop': 'Trigger', 'bag/split': 'Trigger',
     'bag/pause': 'SetBool', 'event/trigger': 'Trigger',
 }  # fmt: skip
-"""What the node serves; test/e2e calls each."""
+"""The services of the node; test/e2e calls each."""
 
 
 def commands_named(pattern: re.Pattern[str]) -> Iterator[tuple[str, re.Match[str]]]:
-    """Each match, with where it stands."""
+    """Each match with its file and line."""
     pages = [page for page in ROOT.glob('docs/**/*.md') if page.parent.name != 'evidence']  # records of what was run then
     files = [ROOT / 'README.md', *pages, *ROOT.glob('launch_configs/*'), *ROOT.glob('tower/*')]
     for path in (*files, *ROOT.glob('shadowhound_data_logger/**/*.py')):
@@ -143,7 +143,7 @@ def commands_named(pattern: re.Pattern[str]) -> Iterator[tuple[str, re.Match[str
 
 
 def test_every_verb_and_option_exists() -> None:
-    """Also those of a verb's verbs, and each option with the verb it is given to."""
+    """Subcommands and their options included."""
     wrong, seen = [], set()
     for where, match in commands_named(COMMAND):
         command: click.Command | None = cli.commands.get(match['verb'])
@@ -162,14 +162,14 @@ def test_every_verb_and_option_exists() -> None:
 
 
 def test_every_service_exists() -> None:
-    """By its name and type."""
+    """With this name and type."""
     calls = [(where, match['name'], match['type']) for where, match in commands_named(SERVICE)]
     assert [call for call in calls if SERVICES.get(call[1]) != call[2]] == []
     assert calls
 
 
 def test_every_parameter_that_is_set_is_live() -> None:
-    """`ros2 param set` of another one would be refused."""
+    """`ros2 param set` rejects other parameters."""
     settings = Settings.load({}, {}, '/')
     owners = {name: getattr(settings, name) for name in GROUPS} | {sensor.name: sensor for sensor in settings.sensors}
     live = {f'{name}.{key}' for name, owner in owners.items() for key, spec in type(owner).__dataclass_fields__.items()
@@ -180,7 +180,7 @@ def test_every_parameter_that_is_set_is_live() -> None:
 
 
 def test_every_link_leads_somewhere() -> None:
-    """In the README and the docs: the file is there, and so is the heading, by the anchor that GitHub gives it."""
+    """In the README and the docs: the file exists, and so does the heading with GitHub's anchor."""
     wrong, seen = [], 0
     for page in (ROOT / 'README.md', *ROOT.glob('docs/**/*.md')):
         for target in re.findall(r'\]\((?!https?://)([^)\s]+)\)', page.read_text(encoding='utf-8')):

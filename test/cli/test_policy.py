@@ -1,4 +1,4 @@
-"""The verbs of who signs policies, and what a robot says when it has received nothing fresh."""
+"""The policy verbs for signing, and what a robot reports when its signed metadata has expired."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Team:
         self.store = open_store(StoreSettings(directory=home / 'store'), UploadSettings())
 
     def run(self, *arguments: object, code: int = 0, **environ: str) -> str:
-        """What it prints, of an error too."""
+        """Returns the output, or the text of an error."""
         runner = CliRunner(env={'SHADOWHOUND_HOME': str(self.home), 'COLUMNS': '200', **environ})
         done = runner.invoke(cli, ['policy', *map(str, arguments)], standalone_mode=False)
         if isinstance(done.exception, DataLoggerError):
@@ -49,7 +49,7 @@ class Team:
         return Metadata[Root].from_bytes((self.keys / 'root.json').read_bytes()).signed
 
     def robot(self, name: str) -> PolicyFolder:
-        """It trusts the root that there is now."""
+        """A robot that trusts the current root."""
         folder = PolicyFolder(self.home / name)
         folder.make()
         (folder.path / 'root.json').write_bytes((self.keys / 'root.json').read_bytes())
@@ -66,10 +66,10 @@ def team(tmp_path: Path) -> Team:
 
 
 def test_a_team_of_one_has_its_keys_with_one_command(team: Team) -> None:
-    """Four files for their owner alone, each with a word on where it belongs; what is there is not overwritten."""
-    said = team.run('keys')
+    """One command makes four files that only the owner can read and prints where each belongs; it never overwrites them."""
+    output = team.run('keys')
     for name, word in (('root.key', 'offline'), ('targets.key', 'stays'), ('online.key', 'refresh'), ('root.json', 'each robot')):
-        assert any(name in line and word in line for line in said.splitlines()), (name, said)
+        assert any(name in line and word in line for line in output.splitlines()), (name, output)
     assert {path.stat().st_mode & 0o777 for path in team.keys.glob('*.key')} == {0o600}
     assert team.keys.stat().st_mode & 0o777 == 0o700
     before = {path: path.read_bytes() for path in team.keys.iterdir()}
@@ -78,7 +78,7 @@ def test_a_team_of_one_has_its_keys_with_one_command(team: Team) -> None:
 
 
 def test_keys_with_a_passphrase_are_encrypted(team: Team) -> None:
-    """They are no use without it; online.key has none, for cron."""
+    """They cannot be used without it; online.key is not encrypted, so that cron can use it."""
     team.run('keys', '--encrypt', SHADOWHOUND_KEY_PASSPHRASE='correct horse')
     assert [b'ENCRYPTED' in (team.keys / f'{name}.key').read_bytes() for name in ('root', 'targets', 'online')] == [
         True,
@@ -94,7 +94,7 @@ def test_keys_with_a_passphrase_are_encrypted(team: Team) -> None:
 
 
 def test_a_root_with_a_threshold_of_two_needs_two_signatures(team: Team) -> None:
-    """Nothing is signed before two of three have; one alone rotates nothing; a robot follows from the first root to the last."""
+    """One signature of three is not enough to sign or rotate; a robot follows every root from the first to the last."""
     people = {name: team.home / 'people' / f'{name}.key' for name in ('alice', 'bob', 'carol')}
     for name in people:
         team.run('keys', '--person', name, '--keys', team.home / 'people')
@@ -104,9 +104,9 @@ def test_a_root_with_a_threshold_of_two_needs_two_signatures(team: Team) -> None
     assert not (team.keys / 'root.key').exists()
     assert 'lacks 2 signatures' in team.run('refresh', code=1)
     root = team.keys / 'root.json'
-    said = team.run('sign-root', root, '--key', people['alice'])
-    assert 'root: 2 of' in said
-    assert '1 missing' in said
+    output = team.run('sign-root', root, '--key', people['alice'])
+    assert 'root: 2 of' in output
+    assert '1 missing' in output
     assert '1 missing' in team.run('sign-root', root, '--key', people['alice']), 'the same signature counts once'
     assert 'complete' in team.run('sign-root', root, '--key', people['bob'])
     robot = team.robot('thor')
@@ -123,14 +123,14 @@ def test_a_root_with_a_threshold_of_two_needs_two_signatures(team: Team) -> None
 
 
 def test_an_interrupted_rotation_is_completed(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever that was, the next verb ends it: with the new root or, where it was not in the store yet, with it as well."""
+    """Wherever it was interrupted, the next verb completes it with the new root."""
     team.run('keys')
     robot = team.robot('thor')
     team.publish('go2/go2_patrol/1')
     for version, step in enumerate(('upload', '_newest_root', 'sign', '_put'), 2):
         with monkeypatch.context() as patch:
             after = {'_newest_root': 1, '_put': 2}.get(step, 0)
-            patch.setattr(SignedMetadata, step, _dying(getattr(SignedMetadata, step), after=after))
+            patch.setattr(SignedMetadata, step, _failing(getattr(SignedMetadata, step), after=after))
             with pytest.raises(ZeroDivisionError):
                 Repository(team.keys, team.store, lambda _: '').rotate(('targets', 'online'))
         assert json.loads(team.run('refresh', '--json'))['listed'] == ['go2/go2_patrol/1'], step
@@ -139,19 +139,19 @@ def test_an_interrupted_rotation_is_completed(team: Team, monkeypatch: pytest.Mo
         assert list(team.keys.glob('*.next*')) == []
 
 
-def _dying(act: Any, after: int) -> Any:
-    """Dies in place of the call after so many."""
+def _failing(act: Any, after: int) -> Any:
+    """``act``, which fails after that many calls."""
     calls = []
 
-    def dies(*given: Any, **named: Any) -> Any:
+    def fails(*given: Any, **named: Any) -> Any:
         calls.append(given)
         return act(*given, **named) if len(calls) <= after else 1 // 0
 
-    return dies
+    return fails
 
 
 def test_new_keys_are_made_with_the_root_alone(team: Team) -> None:
-    """The lists in force stay; if something was signed here, what others signed with a copy of the key ends, and is reported."""
+    """Lists signed here stay valid; versions that others signed with a copy of the key are dropped and reported."""
     team.run('keys')
     robot = team.robot('thor')
     shutil.copytree(team.keys, team.home / 'copy')
@@ -161,21 +161,21 @@ def test_new_keys_are_made_with_the_root_alone(team: Team) -> None:
     (team.keys / 'root.key').rename(vault / 'root.key')
     shutil.copy(team.keys / 'root.json', vault)
     assert 'has no root.key' in team.run('rotate', code=1)
-    said = team.run('rotate', '--keys', vault)
-    assert 'listed are: go2/go2_patrol/1' in said
-    assert 'copy' in said
+    output = team.run('rotate', '--keys', vault)
+    assert 'listed are: go2/go2_patrol/1' in output
+    assert 'copy' in output
     assert team.listed(robot, 'go2/go2_patrol/1')
     Repository(team.home / 'copy', team.store, lambda _: '').load()  # it follows the root
     with pytest.raises(DataLoggerError, match='nothing is delegated'):
         Repository(team.home / 'copy', team.store, lambda _: '').publish({'go2/go2_patrol/2': b'{}'})
     shutil.copytree(vault, team.home / 'third')
     Repository(team.home / 'third', team.store, lambda _: '').publish({'go2/go2_patrol/3': b'{}'})
-    said = team.run('rotate', '--keys', vault)
-    assert 'no longer listed: go2/go2_patrol/3' in said
+    output = team.run('rotate', '--keys', vault)
+    assert 'no longer listed: go2/go2_patrol/3' in output
 
 
 def test_of_two_concurrent_rotations_one_is_valid(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only one of two roots of the same number is in force; who was late keeps none of its keys."""
+    """Only one of two roots with the same version is valid; the second rotation keeps none of its keys."""
     team.run('keys')
     team.publish('go2/go2_patrol/1')
     shutil.copytree(team.keys, team.home / 'other')
@@ -183,7 +183,7 @@ def test_of_two_concurrent_rotations_one_is_valid(team: Team, monkeypatch: pytes
     with pytest.raises(DataLoggerError, match='is not a key of root version'):
         other.rotate(('online',), [team.keys / 'targets.key'])
     with monkeypatch.context() as patch:
-        patch.setattr(SignedMetadata, 'upload', _dying(SignedMetadata.upload, after=0))
+        patch.setattr(SignedMetadata, 'upload', _failing(SignedMetadata.upload, after=0))
         with pytest.raises(ZeroDivisionError):
             other.rotate(('online',))
     assert 'version 2 is in force' in team.run('rotate')
@@ -194,7 +194,7 @@ def test_of_two_concurrent_rotations_one_is_valid(team: Team, monkeypatch: pytes
 
 
 def test_a_delegated_key_signs_some_policies(team: Team) -> None:
-    """What it signs waits for a refresh where online.key is; when its right ends, what it signed may not run."""
+    """What it signs is listed after a refresh with online.key; when its delegation is revoked, robots no longer run it."""
     team.run('keys')
     robot = team.robot('thor')
     dora = team.home / 'dora'
@@ -215,7 +215,7 @@ def test_a_delegated_key_signs_some_policies(team: Team) -> None:
 
 
 def test_a_public_key_must_be_proven_with_its_private_key(team: Team) -> None:
-    """A file that was changed, or that claims another key, is refused."""
+    """A file that was changed, or that names another key, is rejected."""
     team.run('keys')
     for name in ('eve', 'alice'):
         team.run('keys', '--person', name, '--keys', team.home / 'people')
@@ -244,7 +244,7 @@ def test_a_version_is_withdrawn(team: Team) -> None:
 
 
 def test_of_two_concurrent_signers_the_second_repeats(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second one gets an error and repeats it: neither change is lost."""
+    """The second gets an error and tries again: neither change is lost."""
     team.run('keys')
     team.publish('go2/go2_patrol/1')
     one = Repository(team.keys, team.store, lambda _: '')
@@ -264,13 +264,13 @@ def test_of_two_concurrent_signers_the_second_repeats(team: Team, monkeypatch: p
 
 
 def test_stale_metadata_is_reported(team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In policy list, policy show, status and the doctor, with both dates; with a fresh timestamp none of them does."""
+    """``policy list``, status and the doctor report it; with a valid timestamp none of them does."""
     team.run('keys')
     robot = team.robot('.')
     team.run('refresh')
     assert team.listed(robot, 'go2/go2_patrol/1') is False
 
-    def said() -> list[bool]:
+    def reported() -> list[bool]:
         status = CliRunner(env={'SHADOWHOUND_HOME': str(tmp_path)}).invoke(cli, ['status', '--json'], standalone_mode=False)
         doctor = CliRunner(env={'SHADOWHOUND_HOME': str(tmp_path)}).invoke(
             cli, ['doctor', '--role', 'robot', '--only', 'policies', '--json'], standalone_mode=False
@@ -278,55 +278,55 @@ def test_stale_metadata_is_reported(team: Team, tmp_path: Path, monkeypatch: pyt
         texts = (team.run('list'), json.loads(team.run('list', '--json'))['stale'], status.output, doctor.output)
         return ['expired on' in text for text in texts]
 
-    assert said() == [False] * 4
+    assert reported() == [False] * 4
     path = robot.path / 'metadata' / 'timestamp.json'
     old = Metadata[Timestamp].from_bytes(path.read_bytes())
     old.signed.expires = datetime.now(timezone.utc) - timedelta(days=1)
     path.write_bytes(old.to_bytes())  # the state of a fortnight ago
-    assert said() == [True] * 4
+    assert reported() == [True] * 4
 
 
 def test_signing_answers_in_json(team: Team) -> None:
-    """Each verb prints one JSON value, whatever it signs."""
+    """Each verb that signs prints one JSON value."""
 
-    def told(*arguments: object) -> Any:
+    def answer(*arguments: object) -> Any:
         return json.loads(team.run(*arguments, '--json'))
 
     people = team.home / 'people'
     for name in ('alice', 'bob'):
-        told('keys', '--person', name, '--keys', people)
+        answer('keys', '--person', name, '--keys', people)
     publics = [part for name in ('alice', 'bob') for part in ('--root-key', people / f'{name}.pub')]
-    assert told('keys', '--threshold', 2, *publics)['missing_signatures'] == 2
+    assert answer('keys', '--threshold', 2, *publics)['missing_signatures'] == 2
     root = team.keys / 'root.json'
-    assert told('sign-root', root, '--key', people / 'alice.key')['missing_signatures'] == 1
-    signed = told('sign-root', root, '--key', people / 'bob.key')
+    assert answer('sign-root', root, '--key', people / 'alice.key')['missing_signatures'] == 1
+    signed = answer('sign-root', root, '--key', people / 'bob.key')
     assert (signed['root'], signed['signatures'], signed['missing_signatures']) == (str(root), 2, 0)
     team.publish('go2/go2_patrol/7')
-    (name,) = told('delegate', people / 'alice.pub', '--for', 'go2/stairs/*')['names']
+    (name,) = answer('delegate', people / 'alice.pub', '--for', 'go2/stairs/*')['names']
     assert name.startswith('alice-')
-    assert told('delegate', 'alice', '--revoke') == {'names': [name], 'may_sign': []}
-    assert told('withdraw', 'go2_patrol@7') == {'withdrawn': 'go2_patrol@7', 'robot_types': ['go2'], 'refreshed': True}
+    assert answer('delegate', 'alice', '--revoke') == {'names': [name], 'may_sign': []}
+    assert answer('withdraw', 'go2_patrol@7') == {'withdrawn': 'go2_patrol@7', 'robot_types': ['go2'], 'refreshed': True}
     team.publish('go2/go2_patrol/8')
-    begun = told('rotate', '--key', people / 'alice.key')
+    begun = answer('rotate', '--key', people / 'alice.key')
     assert (begun['root_version'], begun['missing_signatures'], begun['listed']) == (2, 1, ['go2/go2_patrol/8'])
-    ended = told('rotate', *(part for name in ('alice', 'bob') for part in ('--key', people / f'{name}.key')))
+    ended = answer('rotate', *(part for name in ('alice', 'bob') for part in ('--key', people / f'{name}.key')))
     assert (ended['missing_signatures'], ended['listed'], ended['no_longer_listed']) == (0, ['go2/go2_patrol/8'], [])
 
 
 def test_a_robot_answers_in_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The verbs that select the active version, and the report that rolls it back (exit code 1)."""
+    """The verbs that select the active version, and a report that rolls back (exit code 1)."""
     monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     scene = Scene(tmp_path)
     ids = [(scene.publish(version), scene.robot.run())[0] for version in (1, 2)]
     scene.store.close()
     robot = Team(tmp_path / 'thor')
 
-    def told(*arguments: object, code: int = 0) -> Any:
+    def answer(*arguments: object, code: int = 0) -> Any:
         return json.loads(robot.run(*arguments, '--json', code=code))
 
-    assert told('pin') == {'pinned': ids[1]}
-    assert told('unpin') == {'pinned': None}
-    assert told('rollback') == {'active': ids[0]}
-    assert told('use', 'go2_patrol@2') == {'active': ids[1], 'pinned': ids[1]}
-    assert told('report', '--failures', 0) == {'policy': ids[1], 'rolled_back': False, 'active': ids[1]}
-    assert told('report', '--failures', 100, code=1) == {'policy': ids[1], 'rolled_back': True, 'active': ids[0]}
+    assert answer('pin') == {'pinned': ids[1]}
+    assert answer('unpin') == {'pinned': None}
+    assert answer('rollback') == {'active': ids[0]}
+    assert answer('use', 'go2_patrol@2') == {'active': ids[1], 'pinned': ids[1]}
+    assert answer('report', '--failures', 0) == {'policy': ids[1], 'rolled_back': False, 'active': ids[1]}
+    assert answer('report', '--failures', 100, code=1) == {'policy': ids[1], 'rolled_back': True, 'active': ids[0]}

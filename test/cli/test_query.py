@@ -1,4 +1,4 @@
-"""``shadowhound-data query`` on a small lake: what it prints in each format, its pictures, and its exit codes."""
+"""``shadowhound-data query`` on a small lake: its output in each format, its images, and its exit codes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shadowhound_data_logger.stores import open_store
 
 @pytest.fixture(scope='module')
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One hour of one day, and two of its pictures."""
+    """One hour of one day, and two of its images."""
     home = tmp_path_factory.mktemp('home')
     fill(folder_store(home), home / 'tmp', days=(0,), hours=(12,))
     picture = io.BytesIO()
@@ -42,7 +42,7 @@ def run(home: Path, *arguments: str) -> Result:
 
 
 def test_a_table_fits_the_terminal(home: Path) -> None:
-    """The earliest first, with what matters; how many there are, and that more are not shown."""
+    """The earliest first; below it the number of objects and that only the first are shown."""
     found = run(home, '--sensor', 'odom')
     assert '2026-10-28 12:00:00  odom' in found.output
     assert '48 objects' in found.output
@@ -54,17 +54,17 @@ def test_a_table_fits_the_terminal(home: Path) -> None:
 
 def test_json_and_csv_are_complete(home: Path) -> None:
     """Every column of every row, times as ISO in UTC."""
-    told = json.loads(run(home, '--sensor', 'odom', '--json').output)
-    assert len(told) == 48
-    assert told[0]['t_start'] == '2026-10-28T12:00:00.000000Z'
-    assert json.loads(run(home, '--sensor', 'odom', '--format', 'json').output) == told
+    answer = json.loads(run(home, '--sensor', 'odom', '--json').output)
+    assert len(answer) == 48
+    assert answer[0]['t_start'] == '2026-10-28T12:00:00.000000Z'
+    assert json.loads(run(home, '--sensor', 'odom', '--format', 'json').output) == answer
     rows = list(csv.DictReader(io.StringIO(run(home, '--sensor', 'odom', '--format', 'csv').output)))
-    assert [one['key'] for one in rows] == [one['key'] for one in told]
-    assert rows[0]['t_start'] == told[0]['t_start']
+    assert [one['key'] for one in rows] == [one['key'] for one in answer]
+    assert rows[0]['t_start'] == answer[0]['t_start']
 
 
 def test_keys_are_for_other_programs(home: Path) -> None:
-    """One a line with its bucket, in the order that was asked for."""
+    """One per line with its bucket, in the requested order."""
     found = run(home, '--failed', '--sensor', 'camera', '--format', 'keys', '--order', 't_start desc', '--limit', '2')
     assert found.output.splitlines() == [
         'sensor-data/thor/camera/20261028/121545_x.jpg', 'sensor-data/thor/camera/20261028/121530_x.jpg',
@@ -72,7 +72,7 @@ def test_keys_are_for_other_programs(home: Path) -> None:
 
 
 def test_flags_restrict_sql(home: Path) -> None:
-    """The flags restrict what the views show."""
+    """Flags also filter the views that SQL reads."""
     found = run(home, 'SELECT mission_id, result, objects FROM missions', '--failed', '--json')
     assert json.loads(found.output) == [{'mission_id': FAILED, 'result': 'FAILED', 'objects': 16}]
     assert '2 rows' in run(home, 'SELECT sensor, count(*) AS n FROM objects GROUP BY sensor').output
@@ -80,7 +80,7 @@ def test_flags_restrict_sql(home: Path) -> None:
 
 @pytest.mark.long('a second of CPU or more')
 def test_a_contact_sheet_is_made_of_the_answer(home: Path, tmp_path: Path) -> None:
-    """A contact sheet of the images that can be read, and the places on the ground."""
+    """--sheet draws the readable images, --map the positions on the ground."""
     sheet, ground = tmp_path / 'sheet.jpg', tmp_path / 'map.png'
     asked = ('--sensor', 'camera', '--until', '2026-10-28T12:00:30', '--near', '0,0,9')
     found = run(home, *asked, '--sheet', str(sheet), '--map', str(ground))
@@ -98,27 +98,27 @@ def test_a_contact_sheet_is_made_of_the_answer(home: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'says'),
+    ('arguments', 'expected'),
     [
         (['SELEC'], 'cannot be answered'), (['--where', 'nope < 3'], 'nope'), (['--since', 'tomorrow'], 'since'),
         (['--near', '1,2'], 'near'), (['--order', 'a b c'], '--order'), (['--order', 'nope'], 'nope'),
         (['SELECT sensor FROM objects', '--format', 'keys'], 'bucket and key'), (['--limit', '0'], 'limit'),
     ],
 )  # fmt: skip
-def test_an_invalid_query_is_wrong_usage(home: Path, arguments: list[str], says: str) -> None:
-    """Exit code 2, and what was not understood."""
+def test_an_invalid_query_is_wrong_usage(home: Path, arguments: list[str], expected: str) -> None:
+    """Exit code 2, and the invalid part is named."""
     found = run(home, *arguments)
     assert found.exit_code == 2
-    assert says in found.output
+    assert expected in found.output
 
 
 @pytest.fixture(scope='module')
-def spoken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unicode_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One object of a mission whose command and type are not ASCII."""
     home = tmp_path_factory.mktemp('spoken')
-    told = {'mission_id': 'm', 'mission_type': '巡逻', 'mission_command': '去厨房 café', 'success': True}
+    summary = {'mission_id': 'm', 'mission_type': '巡逻', 'mission_command': '去厨房 café', 'success': True}
     with closing(open_store(folder_store(home), UploadSettings())) as store:
-        add(store, home / 'tmp', 'thor/missions/run/summary.json', json.dumps(told).encode())
+        add(store, home / 'tmp', 'thor/missions/run/summary.json', json.dumps(summary).encode())
         found = {**row('camera', NOON_NS), 'mission_id': 'm', 'run_id': 'run', 'mission_type': '巡逻'}
         add_part(store, [found], '1', home / 'tmp')
     return home
@@ -128,10 +128,10 @@ def spoken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ('ascii', rb'\u53bb\u53a8\u623f caf\xe9,\u5de1\u903b'), ('latin-1', b'\\u53bb\\u53a8\\u623f caf\xe9,\\u5de1\\u903b'),
     ('utf-8', '去厨房 café,巡逻'.encode()),
 ])  # fmt: skip
-def test_csv_is_utf_8_whatever_the_locale(spoken: Path, encoding: str, cells: bytes) -> None:
-    """What the encoding does not have is escaped; an argument that the locale cannot hold is one line. No traceback."""
+def test_csv_is_utf_8_whatever_the_locale(unicode_home: Path, encoding: str, cells: bytes) -> None:
+    """Other encodings escape what they lack; an argument that the locale cannot decode is an error without a traceback."""
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'query']
-    environ = {**os.environ, 'SHADOWHOUND_HOME': str(spoken), 'AWS_ENDPOINT_URL': '', 'PYTHONIOENCODING': encoding,
+    environ = {**os.environ, 'SHADOWHOUND_HOME': str(unicode_home), 'AWS_ENDPOINT_URL': '', 'PYTHONIOENCODING': encoding,
                'PYTHONUTF8': '0', 'LC_ALL': 'C'}  # fmt: skip
     sql = 'SELECT command, mission_type FROM missions'
     found = subprocess.run([*command, sql, '--format', 'csv'], env=environ, capture_output=True, check=False)
@@ -144,7 +144,7 @@ def test_csv_is_utf_8_whatever_the_locale(spoken: Path, encoding: str, cells: by
 
 @pytest.mark.long('a process of its own')
 def test_a_missing_library_has_a_remedy(home: Path, tmp_path: Path) -> None:
-    """Without Daft it says what to install, as bad usage."""
+    """Without deltalake the error names the extra to install, with exit code 2."""
     (tmp_path / 'deltalake.py').write_text("raise ModuleNotFoundError('no', name='deltalake')\n", encoding='utf-8')
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'query']
     environ = {**os.environ, 'SHADOWHOUND_HOME': str(home), 'PYTHONPATH': f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}'}
@@ -177,7 +177,7 @@ def test_a_missing_library_has_a_remedy(home: Path, tmp_path: Path) -> None:
      (['SELECT mission_tipe FROM missions'], 'cannot be answered', "is 'mission_tipe' 'mission_type'")],
 )  # fmt: skip
 def test_a_name_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str], what: str, remedy: str) -> None:
-    """Exit code 2 and the nearest names; where none is known of a kind, any may exist."""
+    """Exit code 2 and the nearest names; if no name of a kind is known, any name is accepted."""
     env = {'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': ''}
     found = CliRunner().invoke(query, [*arguments, '--format', 'json'], env=env, standalone_mode=False)
     if not what:

@@ -1,4 +1,4 @@
-"""``shadowhound-data spool``: what it says of spools made here, what it delivers, and what it lets wait again."""
+"""``shadowhound-data spool``: what it prints about a spool, what it delivers, and what it retries."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from shadowhound_data_logger.spool.listing import retry
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A robot's, whose spool was left with three objects that wait, one that is refused, and one without a date."""
+    """A robot's home with a spool of three pending objects, a quarantined one, and one that is held for the clock."""
     for name in ('AWS_ENDPOINT_URL', 'AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'SHADOWHOUND_ROBOT'):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
@@ -49,12 +49,12 @@ def run(*arguments: str) -> Result:
     return CliRunner().invoke(cli, ['spool', *arguments], standalone_mode=False)
 
 
-def said(*arguments: str) -> Any:
+def as_json(*arguments: str) -> Any:
     return json.loads(run(*arguments, '--json').stdout)
 
 
 def states(home: Path) -> dict[str, str]:
-    """Key -> state; the files are where their states say, and the ledger balances."""
+    """Key -> state, after checking that the files of pending objects exist and that the ledger balances."""
     found = rows(home / 'spool')
     for row in found:
         if row['state'] == 'pending':
@@ -64,7 +64,7 @@ def states(home: Path) -> dict[str, str]:
 
 
 def test_list_shows_the_spool(home: Path) -> None:
-    """By sensor and state, and what to do about each; exit code 1 because something was refused."""
+    """By sensor and state, with remedies; exit code 1 because an object is quarantined."""
     answer = run()
     assert answer.return_value == 1
     text = ' '.join(answer.stdout.split())
@@ -78,8 +78,8 @@ def test_list_shows_the_spool(home: Path) -> None:
 
 
 def test_the_spool_is_listed_as_json(home: Path) -> None:
-    """As JSON, with the reason as a field of its own."""
-    found = said()
+    """With the reason in a separate field."""
+    found = as_json()
     assert (found['spool'], found['running'], found['quarantined']) == (f'{home}/spool', [], 1)
     heaps = {(heap['sensor'], heap['state'], heap['reason']): (heap['objects'], heap['bytes']) for heap in found['heaps']}
     assert heaps == {
@@ -89,7 +89,7 @@ def test_the_spool_is_listed_as_json(home: Path) -> None:
 
 
 def test_an_empty_spool_is_not_an_error(tmp_path: Path) -> None:
-    """Exit code 0, and a sentence."""
+    """Exit code 0 and a sentence."""
     spool = new_spool(tmp_path / 'spool')
     spool.open()
     spool.close()
@@ -100,7 +100,7 @@ def test_an_empty_spool_is_not_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('verb', [(), ('list',), ('drain',), ('retry',), ('resend-gaps',)])
 def test_without_a_spool_every_verb_names_the_folder(tmp_path: Path, verb: tuple[str, ...]) -> None:
-    """Every verb says which folder, and what names it; none makes one."""
+    """The error names the folder and SHADOWHOUND_HOME; no verb creates a spool."""
     answer = run('--spool', str(tmp_path / 'none'), *verb)
     assert isinstance(answer.exception, SpoolError)
     assert f'there is no spool in {tmp_path}/none' in str(answer.exception)
@@ -109,15 +109,15 @@ def test_without_a_spool_every_verb_names_the_folder(tmp_path: Path, verb: tuple
 
 
 def test_objects_are_listed(home: Path) -> None:
-    """Each object with its file, which is there; by state, by sensor, by how its name begins, and no more than asked for."""
-    found = said('list')
+    """With their files; filtered by state, sensor or prefix; --limit shortens the list."""
+    found = as_json('list')
     assert [one['key'] for one in found] == [
         'thor/camera/a.jpg', 'thor/camera/b.jpg', 'thor/camera/c.jpg', 'thor/camera/d.jpg', 'thor/_unsynced/boot/e.jpg',
     ]  # fmt: skip
     assert all((home / 'spool' / one['path']).read_bytes() for one in found)
-    assert [one['reason'] for one in said('list', '--state', 'quarantined')] == ['access_denied']
-    assert [one['key'] for one in said('list', f'{BUCKET}/thor/_')] == ['thor/_unsynced/boot/e.jpg']
-    assert said('list', '--sensor', 'lidar') == []
+    assert [one['reason'] for one in as_json('list', '--state', 'quarantined')] == ['access_denied']
+    assert [one['key'] for one in as_json('list', f'{BUCKET}/thor/_')] == ['thor/_unsynced/boot/e.jpg']
+    assert as_json('list', '--sensor', 'lidar') == []
     few = run('list', '--limit', '2')
     assert 'camera/b.jpg' in few.stdout
     assert 'camera/c.jpg' not in few.stdout
@@ -125,8 +125,8 @@ def test_objects_are_listed(home: Path) -> None:
 
 
 def test_refused_objects_are_retried(home: Path) -> None:
-    """By its reason; another reason moves nothing, and what waits already stays."""
-    assert said('retry', '--reason', 'foreign') == {'objects': 0, 'bytes': 0, 'gone': 0}
+    """By reason; pending objects and those with other reasons are unchanged."""
+    assert as_json('retry', '--reason', 'foreign') == {'objects': 0, 'bytes': 0, 'gone': 0}
     assert states(home)['d.jpg'] == 'quarantined'
     answer = run('retry', '--reason', 'access_denied')
     assert (answer.return_value, answer.stdout) == (0, '1 object (1 B) will be tried again\n')
@@ -135,21 +135,21 @@ def test_refused_objects_are_retried(home: Path) -> None:
 
 
 def test_one_object_is_retried(home: Path) -> None:
-    """By its name; one that is not quarantined is a finding."""
+    """By name; for an object that is not quarantined the exit code is 1."""
     assert run('retry', f'{BUCKET}/thor/camera/a.jpg').return_value == 1
     assert run('retry', f'{BUCKET}/thor/camera/d.jpg').return_value == 0
     assert states(home)['d.jpg'] == 'pending'
 
 
 def test_gaps_are_resent(home: Path) -> None:
-    """The next part begins anew."""
-    assert said('resend-gaps') == {'rows': 1}
+    """With the next part of the gap journal."""
+    assert as_json('resend-gaps') == {'rows': 1}
     answer = run('resend-gaps')
     assert (answer.return_value, answer.stdout) == (0, '1 row of the gap journal will be sent again with the next part\n')
 
 
 def test_an_object_without_its_file_is_not_retried(home: Path) -> None:
-    """It is said, and the object stays what it was."""
+    """The missing file is reported, and the object stays quarantined."""
     (home / 'spool/quarantine/access_denied' / BUCKET / 'thor/camera/d.jpg').unlink()
     answer = run('retry')
     assert answer.return_value == 1
@@ -158,7 +158,7 @@ def test_an_object_without_its_file_is_not_retried(home: Path) -> None:
 
 
 def test_an_interrupted_retry_is_completed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the file and its row: the next start finishes it."""
+    """If it was interrupted after the file was moved and before its row changed, the next startup completes it."""
 
     def die(*_: object) -> None:
         raise KeyboardInterrupt
@@ -177,9 +177,9 @@ def test_an_interrupted_retry_is_completed(home: Path, monkeypatch: pytest.Monke
 def test_an_object_is_retried_before_its_file_was_quarantined(
     home: Path, monkeypatch: pytest.MonkeyPatch, *, reopens: bool
 ) -> None:
-    """A retry, or another process's start, between the row and the file: the file stays where the object waits."""
+    """If a retry or a startup comes between the row and the file, the file stays in ready/."""
 
-    def meanwhile() -> None:
+    def interfere() -> None:
         if reopens:
             other = new_spool(home / 'spool')
             other.open()
@@ -193,7 +193,7 @@ def test_an_object_is_retried_before_its_file_was_quarantined(
     remove = spool.remove_files
 
     def remove_later(outcomes: Iterable[Outcome]) -> None:
-        meanwhile()
+        interfere()
         remove(outcomes)
 
     with monkeypatch.context() as patched:
@@ -207,7 +207,7 @@ def test_an_object_is_retried_before_its_file_was_quarantined(
 
 
 def test_a_shell_without_the_nodes_server_delivers_nothing(home: Path) -> None:
-    """Else what waits for the server would go to a folder, and count as delivered."""
+    """Otherwise objects for the server would be put into a folder and count as delivered."""
     status = {'store': {'target': 'Tower at http://10.0.0.2:8333'}}
     (home / 'spool' / 'status-thor.json').write_text(json.dumps(status))
     answer = run('drain')
@@ -217,7 +217,7 @@ def test_a_shell_without_the_nodes_server_delivers_nothing(home: Path) -> None:
 
 
 def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To a real server, each object with a row in the catalog; what is held or refused stays, and is told."""
+    """To a real server, each with a row in the catalog; held and quarantined objects stay in the spool and are counted."""
     for name, value in seaweed.environment().items():
         monkeypatch.setenv(name, value)
     answer = run('drain', '--json')
@@ -231,11 +231,11 @@ def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch
         assert db.execute('SELECT count(*) FROM uncataloged').fetchone() == (0,)
         assert db.execute("SELECT count(*) FROM sessions WHERE robot = 'thor'").fetchone() == (1,)
     assert run('retry').return_value == 0
-    assert said('drain')['delivered'] == 3  # the object, its part of the catalog, and that it is not a gap any more
+    assert as_json('drain')['delivered'] == 3  # the object, its part of the catalog, and that it is not a gap any more
 
 
 def test_an_unreachable_store_is_reported(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It gives up after its patience, says why, and everything is still there."""
+    """It gives up after --idle-timeout and prints the reason; the objects stay in the spool."""
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'SECRET')
@@ -248,7 +248,7 @@ def test_an_unreachable_store_is_reported(home: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_running_node_delivers_alone(home: Path) -> None:
-    """Then it says who does, and changes nothing."""
+    """The command reports that another process delivers, and changes nothing."""
     with flock(home / 'spool/drain.lock'):
         answer = run('drain', '--idle-timeout', '1')
     assert answer.return_value == 1
@@ -258,7 +258,7 @@ def test_a_running_node_delivers_alone(home: Path) -> None:
 
 @pytest.mark.parametrize(('retries', 'rounds'), [(0, 1000), (1, 0)])
 def test_the_timeout_is_for_stalls(home: Path, monkeypatch: pytest.MonkeyPatch, retries: int, rounds: int) -> None:
-    """A slice that takes minutes to send is waited for; a store that takes the bytes and refuses each time is not."""
+    """It waits for a slice that takes minutes to send, but not for a store that accepts bytes and then rejects each object."""
     time = SimpleNamespace(now_s=0.0)
     time.monotonic = lambda: time.now_s
     sent = UploadStatus('shipping', '', 0, 1, 0, 0, 0)

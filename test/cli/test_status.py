@@ -49,7 +49,7 @@ def a_topic(**figures: Any) -> dict[str, Any]:
 
 
 def a_status(**changes: Any) -> dict[str, Any]:
-    """As the node writes it; a mapping among the changes is laid over the one that is there."""
+    """A status as the node writes it, with changes; mappings are merged."""
     found: dict[str, Any] = {
         'robot': 'thor', 'version': '0.1.0', 'pid': 12345, 'boot_id': 'b', 'boot_ns': 0, 'time': '2026-11-21T06:39:05.123Z',
         'uptime_s': 7412.3, 'paused': False, 'ended': False, 'middleware': {'undiscovered': None},
@@ -82,7 +82,7 @@ def shown(width: int = 80, *, terminal: bool = True, encoding: str = 'utf-8', st
 
 
 def write(root: Path, **changes: Any) -> None:
-    """A status of this very moment."""
+    """Write a current status."""
     clock = SystemClock.of_this_machine()
     root.mkdir(exist_ok=True)
     given = a_status(boot_id=clock.boot_id, boot_ns=clock.boot_ns(), **changes)
@@ -100,7 +100,7 @@ def line(text: str, start: str) -> str:
 
 
 def test_status_fits_into_80_columns() -> None:
-    """A robot that works has no line that is longer, and none that is broken."""
+    """For a working robot no line is longer or wrapped."""
     text = shown()
     assert max(len(each.rstrip()) for each in text.splitlines()) <= 80
     assert line(text, 'thor') == 'thor  running for 2 h 3 min, process 12345, version 0.1.0'
@@ -114,14 +114,14 @@ def test_status_fits_into_80_columns() -> None:
 
 
 def test_without_a_message_it_names_the_command_that_finds_out_why() -> None:
-    """It is not called fine."""
+    """The verdict is not OK."""
     text = shown(topics={})
     assert 'doctor --only ros' in text
     assert 'Fine' not in text
 
 
 def test_status_shows_the_recording() -> None:
-    """The bag, how much is in it, and what is wrong with it; nothing while nothing is recorded."""
+    """The bag, its size, and its error if there is one; no line while nothing is recorded."""
     bag = {'recording': True, 'paused': False, 'bag': 'patrol_1', 'slice': 3, 'messages': 12_345, 'bytes': 10**7, 'dropped': 0,
            'duration_s': 200.0, 'queue_bytes': 0, 'refused': '', 'topics': {}}  # fmt: skip
     assert 'bag' not in shown(bag={**bag, 'recording': False})
@@ -134,7 +134,7 @@ def test_status_shows_the_recording() -> None:
 
 
 def test_status_shows_events() -> None:
-    """What the ring has and what triggered last; nothing while it is off."""
+    """The content of the ring and the last trigger; no line while it is off."""
     events = {'enabled': True, 'seconds': 30.2, 'bytes': 10**7, 'max_bytes': 64 << 20, 'bag': '', 'refused': '', 'triggers': 2,
               'written': 1, 'topics': {},
               'last': {'name': 'fall', 'by': 'log_event', 'time': '2026-11-21T12:00:00.5Z', 'bag': 'event_fall'}}  # fmt: skip
@@ -148,7 +148,7 @@ def test_status_shows_events() -> None:
 
 
 def test_status_shows_the_active_mission() -> None:
-    """Its type, since when, its id and its run, in 80 columns; nothing where there is none."""
+    """Its type, start, id and run, in 80 columns; no line without a mission."""
     assert 'mission' not in shown()
     mission = {'mission_id': 'patrol_20261121_063605_1f2e3d4c', 'run_id': None, 'type': 'patrol',
                'started': '2026-11-21T06:36:05.123456Z'}  # fmt: skip
@@ -169,7 +169,7 @@ def test_status_shows_the_active_mission() -> None:
     (None, 'tested in an unknown isolation'),
 ])  # fmt: skip
 def test_the_isolation_of_the_active_policy_is_reported(tmp_path: Path, isolation: str | None, text: str) -> None:
-    """With and without --json; a damaged state file of policies is a finding, and the rest of the status is still shown."""
+    """With and without --json; a damaged state file of policies is a finding, and the rest of the status is shown."""
     name = f'go2_patrol@1#{"a" * 16}'
     folder = PolicyFolder(tmp_path)
     folder.make()
@@ -187,7 +187,7 @@ def test_the_isolation_of_the_active_policy_is_reported(tmp_path: Path, isolatio
 
 
 def test_status_estimates_when_requests_finish() -> None:
-    """Requests that wait, their bytes, and how long these take; a node that keeps nothing says nothing of it."""
+    """Waiting requests, their bytes, and how long they will take; no line for a node that keeps nothing."""
     asked = {'open': 2, 'bytes': 120_000_000, 'mbps': 3.2, 'left_s': 300}
     assert '2 open, for 120.0 MB, which arrive in 5 min' in shown(requests=asked)
     assert 'arrive' not in shown(requests={**asked, 'left_s': None})
@@ -196,7 +196,7 @@ def test_status_estimates_when_requests_finish() -> None:
 
 @pytest.mark.parametrize('width', [52, 60])
 def test_a_narrow_terminal_breaks_no_topic(width: int) -> None:
-    """A table that is too wide is a list; other text is folded between words."""
+    """A table that is too wide becomes a list; other text is wrapped between words."""
     topics = {'/tachi/front_camera/image_raw/compressed': a_topic(dropped=1_000)}
     text = shown(width, topics=topics, store={'state': 'store_down', 'last_error': ERROR})
     assert max(map(len, text.splitlines())) <= width
@@ -205,19 +205,19 @@ def test_a_narrow_terminal_breaks_no_topic(width: int) -> None:
 
 
 def test_a_pipe_gets_every_topic_on_one_line() -> None:
-    """Without a terminal the table is as wide as it must be."""
+    """Without a terminal the table is as wide as its content."""
     name = '/tachi/a_camera_with_a_long_name/at_the_front/image_raw/compressed'
     text = shown(terminal=False, topics={name: a_topic(received=10**9, stored=10**9)})
     assert line(text, name).split()[-3:] == ['1,000,000,000', '1,000,000,000', '0']
 
 
 def test_a_terminal_that_knows_only_ascii_gets_ascii() -> None:
-    """The bars are drawn with what can be printed there."""
+    """Bars as well."""
     assert line(shown(encoding='ascii'), 'queue').startswith('queue  ##........  12,345')
 
 
 def test_losses_have_columns_only_where_there_are_any() -> None:
-    """Dropped and rejected appear with their first figure; what is not known is a dash, never 0."""
+    """The columns dropped and rejected appear with the first count; unknown values are dashes, never 0."""
     assert not {'dropped', 'rejected'} & set(shown().split('queue')[0].split())
     text = shown(topics={'/imu': a_topic(dropped=5, missed=None)})
     assert 'dropped' in text
@@ -226,7 +226,7 @@ def test_losses_have_columns_only_where_there_are_any() -> None:
 
 
 def test_topics_without_messages_are_one_line() -> None:
-    """Those that nobody publishes and those that are off are named and take no row; one that was heard before keeps it."""
+    """Topics without a publisher and disabled ones have no row; a topic that was received before keeps its row."""
     gone = a_topic(publishers=0, rate_hz=0.0)
     silent = a_topic(publishers=0, received=0, age_s=None)
     text = shown(topics={'/a': silent, '/b': silent, '/c': gone, '/d': a_topic(enabled=False, rate_hz=0.0),
@@ -237,7 +237,7 @@ def test_topics_without_messages_are_one_line() -> None:
 
 
 def test_problems_have_remedies() -> None:
-    """The store's last error while it is not fine, each worker that fails, and that the node is paused."""
+    """The store's last error while it fails, each failing worker, and a paused node."""
     text = shown(store={'state': 'store_down', 'last_error': 'refused (is it on?)'}, paused=True,
                  findings=('delivery: store down',),
                  workers={'upload': {'failing': True, 'failures': 12, 'last_error': 'OSError: no space'}})  # fmt: skip
@@ -258,7 +258,7 @@ def test_problems_have_remedies() -> None:
     ],
 )
 def test_a_thread_that_failed_is_shown(row: dict[str, Any], words: str | None) -> None:
-    """One that failed and works again says how often and why, one that is stuck for how long; others need no line."""
+    """A restarted one with the number of failures and the reason, a stuck one with the duration; others have no line."""
     workers = {'intake': {'failing': False, 'failures': 0, 'last_error': '', 'busy_s': 0.0, **row}}
     text = shown(100, workers=workers, stalls={'intake': 'it takes no messages'} if 'busy_s' in row else {})
     shown_as = [' '.join(each.split()[1:]) for each in text.splitlines() if each.startswith('intake')]
@@ -266,7 +266,7 @@ def test_a_thread_that_failed_is_shown(row: dict[str, Any], words: str | None) -
 
 
 def test_hostile_text_is_shown_as_text() -> None:
-    """Neither markup nor control characters in names and errors have an effect."""
+    """Markup and control characters in names and errors have no effect."""
     text = shown(topics={'/[red]a[/red]\x1b[31m': a_topic()}, findings=('[bold]x\r\x07\u202e',),
                  store={'state': 'paused', 'target': '[link=x]y', 'last_error': 'a[/]\nb'})  # fmt: skip
     for each in ('/[red]a[/red]?[31m', '[bold]x???', '[link=x]y', 'a[/]?b'):
@@ -275,7 +275,7 @@ def test_hostile_text_is_shown_as_text() -> None:
 
 
 def test_the_status_of_a_hung_node_shows_its_age() -> None:
-    """Not answering: for how long, and its last figures."""
+    """Its age, and its last values."""
     text = shown(state='not_answering', age_s=80.0, findings=('the node has written no status',))
     assert line(text, 'thor') == 'thor  NOT ANSWERING for 1 min 20 s, process 12345, version 0.1.0'
     assert line(text, '/imu')
@@ -283,7 +283,7 @@ def test_the_status_of_a_hung_node_shows_its_age() -> None:
 
 
 def test_exit_codes_and_json_have_the_verdict(tmp_path: Path) -> None:
-    """0 for a node that works, 1 with a finding; --json has what the file has, and the verdict."""
+    """0 for a working node, 1 with a finding; --json has the content of the file and the verdict."""
     write(tmp_path)
     text, as_json = run(tmp_path), run(tmp_path, '--json')
     assert (text.return_value, as_json.return_value) == (0, 0)
@@ -296,7 +296,7 @@ def test_exit_codes_and_json_have_the_verdict(tmp_path: Path) -> None:
 
 
 def test_without_a_node_the_spool_is_shown(tmp_path: Path) -> None:
-    """Exit code 1, what waits, and when it last ran; no figures of a node that is not there."""
+    """Exit code 1, what is pending, and when the node last ran; none of the node's old values."""
     spool = new_spool(tmp_path / 'spool')
     spool.open()
     put(spool, make('a', b'12345'))
@@ -312,7 +312,7 @@ def test_without_a_node_the_spool_is_shown(tmp_path: Path) -> None:
 
 
 def test_status_shows_the_robot_whose_node_runs(tmp_path: Path) -> None:
-    """The one that runs, unless one is asked for by option or environment; others that run are named, or all if none does."""
+    """The running one, unless option or environment name another; other running ones are listed, or all if none runs."""
     write(tmp_path, robot='rex', ended=True)
     write(tmp_path, robot='tachi')
     write(tmp_path, robot='thor')
@@ -328,7 +328,7 @@ def test_status_shows_the_robot_whose_node_runs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('arguments', [['--robot', '../x'], ['--interval', '0'], ['--nonsense']])
 def test_bad_usage_is_exit_code_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]) -> None:
-    """A name that is none, an interval without length and an unknown option are refused."""
+    """An invalid name, an interval of zero, and an unknown option."""
     monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'status', '--spool', str(tmp_path), *arguments])
     with pytest.raises(SystemExit) as caught:
         main()
@@ -338,7 +338,7 @@ def test_bad_usage_is_exit_code_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('as_json', [False, True])
 def test_watch_runs_until_ctrl_c(tmp_path: Path, as_json: bool) -> None:
-    """Into a pipe: a status each time, with --json one line each; Ctrl-C ends it with exit code 0."""
+    """Into a pipe: one status after the other, with --json one per line; Ctrl-C ends it with exit code 0."""
     write(tmp_path)
     command = [sys.executable, '-u', '-m', 'shadowhound_data_logger.cli.main', 'status', '--watch', '--interval', '0.05']
     options = ['--spool', str(tmp_path), *(['--json'] if as_json else [])]
@@ -353,7 +353,7 @@ def test_watch_runs_until_ctrl_c(tmp_path: Path, as_json: bool) -> None:
 
 
 def read_heads(process: subprocess.Popen[str], count: int, as_json: bool) -> list[str]:
-    """The first line of each of so many looks."""
+    """The first line of each of ``count`` updates."""
     assert process.stdout is not None
     heads: list[str] = []
     for each in process.stdout:
@@ -366,7 +366,7 @@ def read_heads(process: subprocess.Popen[str], count: int, as_json: bool) -> lis
 
 @pytest.mark.long('a process of its own')
 def test_watch_restores_the_terminal(tmp_path: Path) -> None:
-    """On a terminal the screen is switched and given back, and the last view stays; exit code 0."""
+    """It uses the alternate screen, and the last view remains on the normal one; exit code 0."""
     write(tmp_path)
     ours, theirs = os.openpty()
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'status', '--watch', '--interval', '0.05']
@@ -393,7 +393,7 @@ def test_watch_restores_the_terminal(tmp_path: Path) -> None:
 
 
 def test_a_topic_that_other_nodes_receive_is_not_called_silent() -> None:
-    """Somebody publishes it, as the finding says."""
+    """The finding names its publishers."""
     row = a_topic(publishers=0, received=0)
     undiscovered = {'/imu': {'text': '/imu is not all heard'}}
     text = shown(topics={'/imu': row}, middleware={'undiscovered': undiscovered}, findings=['/imu is not all heard'])
@@ -411,7 +411,7 @@ ANY = st.recursive(st.none() | st.booleans() | NUMBERS | TEXTS, lambda inner: st
 
 
 def of_type(hint: Any) -> st.SearchStrategy[Any]:
-    """Values that a field takes, extreme ones among them, and now and then another one."""
+    """Values of a field's type, including extreme ones, and sometimes a value of another type."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in {Union, UnionType}:
         (kind,) = (each for each in arguments if each is not NoneType)
@@ -431,7 +431,7 @@ def of_dataclass(kind: Any) -> st.SearchStrategy[dict[str, Any]]:
 
 
 def shown_status(home: Path, *arguments: str, columns: int = 80) -> str:
-    """What the verb prints; an exit code that is not in the table, or a traceback, fails."""
+    """The output; an unknown exit code or a traceback fails."""
     ran = CliRunner(env={'SHADOWHOUND_HOME': str(home), 'COLUMNS': str(columns)}).invoke(
         cli, arguments, standalone_mode=False, catch_exceptions=False
     )
@@ -455,7 +455,7 @@ FUZZ: Final = settings(suppress_health_check=[HealthCheck.function_scoped_fixtur
 @FUZZ
 @given(status=of_dataclass(NodeStatus))
 def test_any_values_of_a_running_node_are_shown(tmp_path: Path, status: dict[str, Any]) -> None:
-    """All fields have the types that they should have, and values that nobody would write."""
+    """All fields have valid types but unusual values."""
     write_status(tmp_path, {**status, **running()})
     assert 'thor' in shown_status(tmp_path, 'status')
     document = json.loads(shown_status(tmp_path, 'status', '--json'))
@@ -465,7 +465,7 @@ def test_any_values_of_a_running_node_are_shown(tmp_path: Path, status: dict[str
 @FUZZ
 @given(document=ANY | st.dictionaries(st.sampled_from([*get_type_hints(NodeStatus), 'x']), ANY, max_size=4))
 def test_any_json_document_is_shown_or_an_error(tmp_path: Path, document: Any) -> None:
-    """The file is JSON, and nothing else of it is as it should be."""
+    """Any JSON document as the status file."""
     write_status(tmp_path, {**document, **running()} if isinstance(document, dict) else document)
     assert 'thor' in shown_status(tmp_path, 'status')
 
@@ -482,7 +482,7 @@ def test_a_file_that_is_not_json_is_an_error(tmp_path: Path, content: bytes) -> 
 
 @pytest.mark.parametrize('started', ['', 'yesterday', '9999-99-99T00:00:00Z', '2026-11-20T12:00:00+25:00', 'Z'])
 def test_a_mission_with_an_invalid_start_is_shown(tmp_path: Path, started: str) -> None:
-    """It is shown, and its start is unknown."""
+    """Its start is unknown."""
     write_status(
         tmp_path,
         {**running(), 'time': '2026-11-20T12:00:05Z', 'mission': {'mission_id': 'm1', 'type': 'patrol', 'started': started}},
@@ -493,7 +493,7 @@ def test_a_mission_with_an_invalid_start_is_shown(tmp_path: Path, started: str) 
 def test_the_program_ends_without_a_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also where a figure is out of any range."""
+    """Even if a value is out of range."""
     write_status(tmp_path, {**running(), 'uptime_s': 1e308, 'queue': {'messages': 10**30, 'max_messages': 1}})
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
     monkeypatch.setattr(sys, 'argv', ['shadowhound-data', 'status'])

@@ -60,7 +60,7 @@ def plain(house: House) -> Lerobot:
 
 @pytest.mark.parametrize('codec', [AV1, pytest.param(H264, marks=pytest.mark.long('the same with another codec'))])
 def test_one_video_has_the_frames_of_all_episodes(house: House, tmp_path: Path, codec: str) -> None:
-    """As encoded: the position in the file is the frame's number in the dataset, by which lerobot streams."""
+    """As encoded: the position in the file is the frame's number in the dataset, which lerobot streams by."""
     made = exported(house, tmp_path / 'set', codec=codec)
     own = exported(house, tmp_path / 'own', layout='episode', codec=codec)
     assert [path.name for path in sorted((tmp_path / 'set').rglob('*.mp4'))] == ['file-000.mp4']

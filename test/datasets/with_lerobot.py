@@ -21,7 +21,7 @@ os.environ |= {'HF_HUB_OFFLINE': '1', 'HF_DATASETS_OFFLINE': '1', 'TOKENIZERS_PA
 
 def refused(method: Callable[..., Any]) -> Callable[..., Any]:
     def connect(self: socket.socket, *arguments: Any) -> Any:
-        if self.family != socket.AF_UNIX:  # by which the workers of a DataLoader hand over memory
+        if self.family != socket.AF_UNIX:  # the workers of a DataLoader pass memory through it
             raise OSError('this test has no network')
         return method(self, *arguments)
 
@@ -103,7 +103,7 @@ def compared(found: Iterable[Mapping[str, Any]], frames: list[Mapping[str, Any]]
             seen.append(index)
             if not all(is_same(name, value, index, frames, bounds) for name, value in item.items()):
                 wrong.append(index)
-    except Exception as error:  # noqa: BLE001 - what lerobot raises is what is asked for
+    except Exception as error:  # noqa: BLE001 - the error that lerobot raises is the result
         return {'seen': len(seen), 'wrong': wrong, 'error': f'{type(error).__name__}: {error}'[:300]}
     return {'seen': len(set(seen)), 'wrong': wrong, 'error': ''}
 

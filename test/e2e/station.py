@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 NODE = '/sensor_logger_node'
 ASK_S = WAIT_S / 3
 """After this time a request is sent again. A client that the server has not discovered yet may never get a response: ROS services
-are pairs of topics, and neither rmw_fastrtps nor rmw_cyclonedds tells a client that the server has discovered both of its own.
+are pairs of topics, and with rmw_fastrtps and rmw_cyclonedds a client cannot know that the server has discovered both.
 """
 
 

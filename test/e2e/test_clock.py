@@ -111,7 +111,7 @@ def test_objects_are_dated_when_the_clock_is_set(robot: Robot) -> None:
     ledger = robot.node.stop()
     assert ledger['objects']['held'] == 0
     assert (ledger['clock']['is_set'], ledger['clock']['steps'], ledger['clock']['held']) == (True, 1, 0)
-    keys = [key for key in robot.keys() if '/_' not in key]  # noqa: SIM118 - a method of its own
+    keys = [key for key in robot.keys() if '/_' not in key]  # noqa: SIM118 - not the method of a dict
     today = {time.strftime('%Y%m%d', time.gmtime(when / SECOND)) for span in robot.spans for when in span}
     assert {key.split('/')[2] for key in keys} == today
     assert not [key for key in keys if '1970' in key or '_unsynced' in key]

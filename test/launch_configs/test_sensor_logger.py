@@ -20,7 +20,7 @@ FILE = Path(__file__).parents[2] / 'launch_configs' / 'sensor_logger.launch.py'
 
 
 def commands(given: Mapping[str, str], nodes: int = 1) -> list[list[str]]:
-    """What it starts beside so many nodes, with these arguments of ``ros2 launch``."""
+    """What it starts next to so many nodes, with these arguments of ``ros2 launch``."""
     from launch.actions import ExecuteProcess, OpaqueFunction
     from launch.utilities import perform_substitutions
 

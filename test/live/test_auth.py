@@ -90,7 +90,7 @@ async def ended(ws: aiohttp.ClientWebSocketResponse) -> None:
 
 
 async def answers(ws: aiohttp.ClientWebSocketResponse, ping: int) -> None:
-    """Wait until a viewer's ping is answered, as it is while the viewer may watch."""
+    """Wait until a viewer's ping is answered, which happens only while the viewer may watch."""
     await ws.send_json({'ping': ping})
     while f'"ping":{ping},'.encode() not in (await ws.receive_bytes(timeout=60.0)):
         pass

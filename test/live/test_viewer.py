@@ -258,7 +258,7 @@ def test_a_narrow_link_is_not_filled_beyond_what_it_holds(now: list[float], rate
 
 
 def test_with_video_large_items_get_a_share_of_the_link(now: list[float]) -> None:
-    """Of the link as it was before: traffic next to video is no measure of it. Rows only wait for that part of the latency."""
+    """A share of the earlier estimate: traffic next to video does not measure the link. Rows only wait for that part."""
     viewer = Viewer(lambda: now[0])
     viewer.round_s = 0.1
     link = Link(viewer, now, 2e6, 0.1)

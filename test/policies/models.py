@@ -1,4 +1,4 @@
-"""Policies to be packed, small ONNX models that do what a test needs, and a robot that takes them."""
+"""Small ONNX models, packed policies, and a robot that syncs them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STATE, ACTION = 'observation.state', 'action'
 
 
 def bucket_of(tower: Tower) -> Any:
-    """The administrator's client of a Tower that has the bucket of policies, as one that was prepared, and is of no team yet."""
+    """The administrator's client of a Tower with an empty bucket for policies."""
     keys = tower.environment()
     client = boto3.client('s3', endpoint_url=tower.endpoint_url, region_name='us-east-1',
                           aws_access_key_id=keys['AWS_ACCESS_KEY_ID'],
@@ -58,7 +58,7 @@ def linear(gain: float = 0.5, operator: str = 'MatMul', extra: int = 0) -> onnx.
 
 
 def trained(folder: Path, model: onnx.ModelProto | None = None) -> Path:
-    """The output of a training, and a sample."""
+    """A folder with the output of a training, and a sample next to it."""
     folder.mkdir(parents=True)
     (folder / 'model.onnx').write_bytes((model or linear()).SerializeToString())
     features: dict[str, Any] = {
@@ -73,7 +73,7 @@ def trained(folder: Path, model: onnx.ModelProto | None = None) -> Path:
 
 @dataclass
 class Spark:
-    """A team of one, which packs and signs: a folder with its keys."""
+    """A team with one key per role, which packs and signs."""
 
     folder: Path
     name: str = 'go2_patrol'
@@ -85,20 +85,20 @@ class Spark:
 
     @property
     def root(self) -> Path:
-        """What robots trust."""
+        """The root that robots trust."""
         return self.keys / ROOT
 
     def signing(self, store: ObjectStore, **given: Any) -> Repository:
-        """Where it signs."""
+        """A repository to sign in."""
         return Repository(self.keys, store, lambda _: '', **given)
 
     def trusted_by(self, folder: PolicyFolder) -> None:
-        """Install the root on a robot, as a person does."""
+        """Install the root on a robot."""
         folder.make()
         shutil.copy(self.root, folder.path / ROOT)
 
     def packed(self, version: int, model: onnx.ModelProto | None = None, **given: Any) -> tuple[Path, PolicyManifest]:
-        """A version."""
+        """Pack a version."""
         folder = trained(self.folder / f'trained_{version}', model or linear(0.1 * version))
         packed = self.folder / f'packed_{version}'
         packing.pack(folder, folder.with_suffix('.npz'), packed, packing.Packing(
@@ -107,22 +107,23 @@ class Spark:
 
 
 class Aliases:
-    """A registry that says what a test says."""
+    """A registry whose aliases are set by the test."""
 
     def __init__(self) -> None:
-        self.told: dict[str, RegisteredVersion] = {}
+        self._aliases: dict[str, RegisteredVersion] = {}
 
     def alias(self, name: str, alias: str) -> RegisteredVersion | None:
-        return self.told.get(alias)
+        return self._aliases.get(alias)
 
-    def say(self, alias: str, version: int, *, source: str = '', robots: frozenset[str] = frozenset(), name: str = 'go2_patrol'
-            ) -> None:  # fmt: skip
-        self.told[alias] = RegisteredVersion(name, version, source or source_of('go2', name, version), robots)
+    def set_alias(
+        self, alias: str, version: int, *, source: str = '', robots: frozenset[str] = frozenset(), name: str = 'go2_patrol'
+    ) -> None:
+        self._aliases[alias] = RegisteredVersion(name, version, source or source_of('go2', name, version), robots)
 
 
 @dataclass
 class Scene:
-    """A Spark, a store in a folder, a registry, and a robot that trusts the key."""
+    """A team, a store in a folder, a registry, and a robot that trusts the team."""
 
     path: Path
     registry: Aliases = field(default_factory=Aliases)
@@ -146,17 +147,17 @@ class Scene:
         packed, manifest = self.spark.packed(version, model, **given)
         shutil.copytree(packed, self.place(version))
         self.sign(version)
-        self.registry.say(alias, version)
+        self.registry.set_alias(alias, version)
         return manifest.id
 
     def forge(self, version: int, change: Callable[[dict[str, Any]], object]) -> None:
-        """A manifest that says something else, well signed."""
-        told = json.loads((self.place(version) / MANIFEST).read_bytes())
-        change(told)
-        self.sign(version, json.dumps(told).encode())
+        """Change a manifest and sign it again."""
+        manifest = json.loads((self.place(version) / MANIFEST).read_bytes())
+        change(manifest)
+        self.sign(version, json.dumps(manifest).encode())
 
     def sign(self, version: int, content: bytes | None = None) -> None:
-        """List what is in the store as this version, or this manifest instead."""
+        """Sign the manifest in the store, or ``content`` instead."""
         path = self.place(version) / MANIFEST
         if content is not None:
             path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""What a robot refuses to run because of its content, each for a separate reason."""
+"""Versions that a robot refuses to run because of their content, with the reason for each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shadowhound_data_logger.policies.content import check_content
 
 
 def test_data_outside_of_the_model_is_refused(tmp_path: Path) -> None:
-    """Tensors in other files, in any corner of the model, and engines that the runtime would load."""
+    """Tensors in other files, wherever in the model, and engines that the runtime would load."""
     path = tmp_path / 'model.onnx'
     whole = linear()
     path.write_bytes(whole.SerializeToString())

@@ -1,4 +1,4 @@
-"""The smoke run: what it refuses, and what code inside it can do to the robot."""
+"""The smoke run: which versions it refuses, and what code inside it can do to the robot."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def connect(family, address, kind=socket.SOCK_STREAM):
         client.settimeout(5)
         client.connect(address)
         client.sendall(b'{"do": "pause"}')
-        client.sendall(b'')  # a datagram that reached nobody was refused meanwhile
+        client.sendall(b'')  # fails if the first datagram was refused
 
 def overwrite(path):
     with open(path, 'r+b') as file, mmap.mmap(file.fileno(), 0) as memory:
@@ -54,8 +54,8 @@ attacks = {
     'read the S3 keys': lambda: (home / 'logger.env').read_text(),
     'read the environment of the node': lambda: Path(f'/proc/{parent}/environ').read_bytes(),
     'list the spool': lambda: os.listdir(home / 'spool'),
-    'say something to the control socket': lambda: connect(socket.AF_UNIX, str(home / 'spool/control.sock')),
-    'say something to an abstract socket': lambda: connect(socket.AF_UNIX, f'\\0shadowhound-{parent}'),
+    'write to the control socket': lambda: connect(socket.AF_UNIX, str(home / 'spool/control.sock')),
+    'write to an abstract socket': lambda: connect(socket.AF_UNIX, f'\\0shadowhound-{parent}'),
     'overwrite state.json through mmap': lambda: overwrite(home / 'policies/state.json'),
     'overwrite its own model through mmap': lambda: overwrite(home / 'policies/incoming/it/model.onnx'),
     'swap policies/current': lambda: swap(home / 'policies/current'),
@@ -101,9 +101,9 @@ with tempfile.TemporaryDirectory() as empty:
     assert not problem, problem
     arguments = [str(home), str(os.getpid()), str(victim.pid), str(servers[0].getsockname()[1])]
     child = [*command, sys.executable, '-B', '-c', attacks, *arguments]
-    told, code = smoke._run_child(child, smoke.environ_of(empty), empty, 60.0)
+    output, code = smoke._run_child(child, smoke.environ_of(empty), empty, 60.0)
 found = {
-    **json.loads(told), 'code': code, 'victim': victim.poll(), 'current': os.readlink(home / 'policies/current'),
+    **json.loads(output), 'code': code, 'victim': victim.poll(), 'current': os.readlink(home / 'policies/current'),
     'state': (home / 'policies/state.json').read_text(), 'spool': sorted(os.listdir(home / 'spool')),
 }
 victim.kill()
@@ -114,7 +114,7 @@ print(json.dumps(found))
 
 @pytest.fixture
 def home() -> Iterator[Path]:
-    """The home of an ordinary user, whom nothing above it keeps out."""
+    """The home of an unprivileged user, in folders that this user can enter."""
     with tempfile.TemporaryDirectory(prefix='shadowhound-home-') as folder:
         if os.getuid() == 0:
             os.chown(folder, 65534, 65534)
@@ -207,7 +207,7 @@ def test_the_sandbox_shows_no_folder_that_contains_the_home(tmp_path: Path, monk
 def test_a_version_tried_with_less_isolation_is_tried_again_before_activation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str
 ) -> None:
-    """Once more isolation is required than a version here was tried in, it waits for a smoke run that has that."""
+    """If more isolation is required than in the version's last smoke run, it is not activated before another smoke run."""
     runs: list[str] = []
     possible = LIMITS
 
@@ -235,7 +235,7 @@ def test_a_version_tried_with_less_isolation_is_tried_again_before_activation(
         with scene.folder.state.changing() as state:
             state.pin = first
     else:
-        scene.registry.say('champion', 1)
+        scene.registry.set_alias('champion', 1)
     with pytest.raises(PolicyError, match='was not run'):
         scene.robot.run()
     assert scene.folder.current() == second
@@ -258,7 +258,7 @@ def test_an_isolation_is_compared_with_the_required_one(isolation: str | None, e
 
 
 def greedy() -> onnx.ModelProto:
-    """It wants 32 GiB before it says anything."""
+    """A model that allocates 32 GiB."""
     model = linear()
     model.graph.initializer.append(numpy_helper.from_array(np.array([1 << 33]), 'size'))
     model.graph.node[0].output[0] = 'half'
@@ -277,16 +277,16 @@ def greedy() -> onnx.ModelProto:
     ('slow', {'p99_ms': 1e-6}),
 ])  # fmt: skip
 def test_the_smoke_run_refuses_each_kind_of_bad_model(tmp_path: Path, reason: str, change: dict[str, Any]) -> None:
-    """What does not give what was promised, is too slow, or does not run at all; each by a process that runs the model."""
+    """Wrong outputs, invalid values, too slow, too much memory, or not executable: each in a process that runs the model."""
     packed, _ = Spark(tmp_path).packed(1)
-    told = json.loads((packed / MANIFEST).read_bytes())
+    content = json.loads((packed / MANIFEST).read_bytes())
     for kind, name in (('inputs', STATE), ('outputs', ACTION)):
         if kind in change:
-            np.save(packed / told['smoke'][kind][name], change[kind], allow_pickle=True)
+            np.save(packed / content['smoke'][kind][name], change[kind], allow_pickle=True)
     if 'model' in change:
         (packed / 'model.onnx').write_bytes(change['model'].SerializeToString())
-    told['limits']['p99_ms'] = change.get('p99_ms', 5000.0)
-    (packed / MANIFEST).write_text(json.dumps(told))
+    content['limits']['p99_ms'] = change.get('p99_ms', 5000.0)
+    (packed / MANIFEST).write_text(json.dumps(content))
     manifest = parse_manifest((packed / MANIFEST).read_bytes())
     if not reason:
         assert run_smoke(packed, manifest, LIMITS).p99_ms > 0.0
@@ -301,8 +301,8 @@ def test_a_smoke_run_that_crashes_or_hangs_refuses_the_version(tmp_path: Path, m
     with pytest.raises(PolicyRefused) as raised:
         run_smoke(packed, manifest, LIMITS, limit_s=0.0)
     assert raised.value.reason == 'time'
-    for told in ((b'', -11), (b'[' * 100_000, 0), (b'{"reason": ""}', 1), (b'\xff' * 70_000, -9)):
-        monkeypatch.setattr(smoke, '_run_child', lambda *_, told=told: told)
+    for output in ((b'', -11), (b'[' * 100_000, 0), (b'{"reason": ""}', 1), (b'\xff' * 70_000, -9)):
+        monkeypatch.setattr(smoke, '_run_child', lambda *_, output=output: output)
         with pytest.raises(PolicyRefused) as raised:
             run_smoke(packed, manifest, LIMITS)
         assert raised.value.reason == 'smoke'
@@ -311,7 +311,7 @@ def test_a_smoke_run_that_crashes_or_hangs_refuses_the_version(tmp_path: Path, m
 CONFINED = """
 import os, sys
 from shadowhound_data_logger.policies import smoke
-if os.getuid() == 0:  # whom no limit of processes holds
+if os.getuid() == 0:  # the limit of processes does not apply to root
     os.setgroups([])
     os.setgid(65534)
     os.setuid(65534)
@@ -365,13 +365,13 @@ time.sleep(600)
 
 
 def test_processes_started_by_the_smoke_run_end_with_it(tmp_path: Path) -> None:
-    """With a bound of what is read of it, and of its time."""
+    """The output that is read from it is bounded, and so is its time."""
 
     def run(program: str, limit_s: float = 600.0) -> tuple[bytes, int | None]:
         return smoke._run_child([sys.executable, '-c', program, str(tmp_path / 'pid')], os.environ, str(tmp_path), limit_s)
 
-    told, _ = run(STARTS)
-    assert len(told) <= 2 * smoke.MAX_ANSWER_BYTES
+    output, _ = run(STARTS)
+    assert len(output) <= 2 * smoke.MAX_ANSWER_BYTES
     assert gone(int((tmp_path / 'pid').read_text()))
     assert run('print(1)') == (b'1\n', 0)
     assert run('import os; os.abort()') == (b'', -6)
@@ -379,7 +379,7 @@ def test_processes_started_by_the_smoke_run_end_with_it(tmp_path: Path) -> None:
 
 
 def gone(pid: int) -> bool:
-    """Waits for its end."""
+    """Whether the process has ended within a minute."""
     end = time.monotonic() + 60.0
     while time.monotonic() < end:
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""What an attacker with stolen keys, or with the store, can do to a robot: the attacks of The Update Framework, and our own.
+"""What an attacker with stolen keys or access to the store can do to a robot: the attacks of The Update Framework, and more.
 
 https://theupdateframework.github.io/specification/latest/#goals-to-protect-against-specific-attacks
 """
@@ -45,7 +45,7 @@ DAY_NS: Final = 86_400 * 10**9
 
 
 class Battle:
-    """A team of one, its store, a robot that trusts it, and a thief who may write to the store and say what the registry says."""
+    """A team with one key each, its store, a robot that trusts it, and a thief who can write to the store and the registry."""
 
     def __init__(self, path: Path, store: ObjectStore) -> None:
         self.path = path
@@ -57,13 +57,13 @@ class Battle:
         settings = PolicySettings(name='go2_patrol', robot='thor', min_free_bytes=0)
         self.robot = PolicySync(self.folder, store, self.registry, settings, pause=lambda _: None)
 
-    # -- the store, as who has its keys sees it ----------------------------------------------------------------------
+    # -- the store, with full access ---------------------------------------------------------------------------------
 
     def read(self, name: str) -> bytes:
         return self.store.get(BUCKET, f'{METADATA}/{name}')
 
     def write(self, name: str, body: bytes, folder: str = METADATA) -> None:
-        """In the place of whatever is there."""
+        """Replace an object."""
         path = self.path / 'body'
         path.write_bytes(body)
         key = f'{folder}/{name}'
@@ -72,16 +72,16 @@ class Battle:
         self.store.put(SpooledObject(1, BUCKET, key, path, len(body), sha256, 'application/json', {}, 5, 0))
 
     def saved(self) -> dict[str, bytes]:
-        """All current metadata."""
+        """Returns all current metadata."""
         found = [info.key for info in self.store.list(BUCKET, f'{METADATA}/')]
         return {key.rpartition('/')[2]: self.store.get(BUCKET, key) for key in found}
 
     def newest(self, role: str) -> int:
-        """The number of its last file."""
+        """The highest version of a role's files."""
         numbers = (int(name.partition('.')[0]) for name in self.saved() if name.endswith(f'.{role}.json'))
         return max(number for number in numbers if number < FAR)
 
-    # -- what is signed ----------------------------------------------------------------------------------------------
+    # -- the team ----------------------------------------------------------------------------------------------------
 
     def upload(self, version: int, spark: Spark | None = None) -> bytes:
         """Upload the files of a version, by any author, to a location that a registry may name; returns its manifest."""
@@ -92,14 +92,14 @@ class Battle:
         return (packed / MANIFEST).read_bytes()
 
     def publish(self, version: int, **given: Any) -> str:
-        """A version as its team publishes it; its id."""
+        """Publish a version as its team does; returns its id."""
         content = self.upload(version)
         self.spark.signing(self.store).publish({target_of('go2', 'go2_patrol', version): content}, **given)
-        self.registry.say('champion', version)
+        self.registry.set_alias('champion', version)
         return parse_manifest(content).id
 
     def stolen(self) -> Thief:
-        """What a thief has: a copy of the folder of keys, without the root, which was offline."""
+        """A thief with a copy of the key folder, without the root key, which was offline."""
         shutil.copytree(self.spark.keys, self.path / 'stolen')
         root = self.spark.keys / 'root.key'
         if root.exists():
@@ -113,7 +113,7 @@ class Battle:
     # -- the robot ---------------------------------------------------------------------------------------------------
 
     def refused(self) -> str:
-        """Why it takes nothing new; what was active stays."""
+        """The reason why a sync is refused; the active version stays."""
         before = self.folder.current()
         with pytest.raises(PolicyRefused) as raised:
             self.robot.run()
@@ -121,12 +121,12 @@ class Battle:
         return raised.value.reason
 
     def taken(self) -> str | None:
-        """What is active after a look at the store."""
+        """The active version after a sync."""
         return self.robot.run().active
 
 
 class Thief:
-    """Signs with stolen keys, by the metadata API alone: our tools would refuse most of it."""
+    """Signs with stolen keys through the metadata API, as our tools would refuse most of it."""
 
     def __init__(self, battle: Battle, keys: Path) -> None:
         self.battle = battle
@@ -139,7 +139,7 @@ class Thief:
         return metadata.to_bytes()
 
     def targets(self, version: int, evil: bytes) -> bytes:
-        """All versions that are listed now, and an evil one."""
+        """A list with all current versions and an evil one."""
         lists = self.battle.spark.signing(self.battle.store).load().lists
         listed = deepcopy(lists['targets'].signed)
         listed.version = version
@@ -148,7 +148,7 @@ class Thief:
         return self.signed(listed, 'targets')
 
     def online(self, version: int, targets: bytes, number: int, name: str = 'online') -> None:
-        """A snapshot and a timestamp of this version for a list of this number."""
+        """Write a snapshot and a timestamp for a list."""
         until = datetime.now(timezone.utc) + timedelta(days=1000)
         old = Metadata[Snapshot].from_bytes(self.battle.read(self.snapshot())).signed
         meta = {**old.meta, 'targets.json': MetaFile.from_data(number, targets, ['sha256'])}
@@ -165,13 +165,13 @@ class Thief:
     def evil(self) -> bytes:
         """The manifest of a version that no team member created; all its files are in the store, and the registry names it."""
         content = self.battle.upload(EVIL, Spark(self.battle.path / 'evil'))
-        self.battle.registry.say('champion', EVIL)
+        self.battle.registry.set_alias('champion', EVIL)
         return content
 
 
 @pytest.fixture(params=['directory', pytest.param('seaweedfs', marks=[pytest.mark.seaweedfs, pytest.mark.long('a real store')])])
 def battle(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Battle]:
-    """Version 1 is active; smoke runs go well."""
+    """Version 1 is active; smoke runs succeed."""
     monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     settings = StoreSettings(directory=tmp_path / 'store')
     if request.param == 'seaweedfs':
@@ -187,7 +187,7 @@ def battle(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.M
         yield battle
 
 
-# -- who holds the store, and no key ---------------------------------------------------------------------------------------------
+# -- an attacker with the store and no key ---------------------------------------------------------------------------------------
 
 
 def test_unsigned_software_does_not_run(battle: Battle) -> None:
@@ -203,15 +203,15 @@ def test_unsigned_software_does_not_run(battle: Battle) -> None:
 
 
 def test_older_metadata_is_refused(battle: Battle) -> None:
-    """Older metadata, which were signed well, are not taken back; nor is a signer's own folder misled to sign them again."""
+    """Neither robots nor signers accept older metadata, although its signatures are valid."""
     before = battle.saved()
     second = battle.publish(2)
     assert battle.taken() == second
     for name, body in before.items():
         battle.write(name, body)
-    battle.registry.say('champion', 1)
+    battle.registry.set_alias('champion', 1)
     assert battle.robot.run().stale
-    battle.registry.say('champion', 2)
+    battle.registry.set_alias('champion', 2)
     assert battle.robot.run().active == second
     battle.spark.signing(battle.store).refresh()
     assert battle.robot.run().stale == ''
@@ -223,23 +223,23 @@ def test_older_metadata_is_refused(battle: Battle) -> None:
 
 
 def test_expired_metadata_is_reported_and_nothing_new_is_accepted(battle: Battle) -> None:
-    """With expired metadata the robot keeps its policy, accepts nothing new, and reports it; later it recovers."""
+    """The robot keeps its policy and reports the expiry; after a refresh it accepts new versions again."""
     first, second = battle.folder.current(), battle.publish(2)
     battle.spark.signing(battle.store, days=0.0).refresh()
     assert battle.refused() == 'expired'
-    battle.registry.say('champion', 1)
+    battle.registry.set_alias('champion', 1)
     kept = battle.robot.run()
     assert (kept.active, kept.done) == (first, 'unchanged')
     assert 'has expired' in kept.stale
     assert why_stale(battle.folder.path, time.time_ns()) == ''
     assert 'expired on' in why_stale(battle.folder.path, time.time_ns() + 20 * DAY_NS)
     battle.spark.signing(battle.store).refresh()
-    battle.registry.say('champion', 2)
+    battle.registry.set_alias('champion', 2)
     assert battle.taken() == second
 
 
 def test_metadata_of_different_times_is_not_combined(battle: Battle) -> None:
-    """Signed files from two different times are not accepted together."""
+    """Correctly signed files from two different times are rejected together."""
     battle.publish(2)
     for role in ('targets', 'snapshot'):
         latest = battle.newest(role)
@@ -249,7 +249,7 @@ def test_metadata_of_different_times_is_not_combined(battle: Battle) -> None:
 
 @pytest.mark.parametrize('role', ['timestamp', 'root', 'snapshot', 'targets'])
 def test_endless_files_are_read_to_their_maximum_size_only(battle: Battle, role: str) -> None:
-    """No more of a file is read than it may have, whatever is in the store; the next refresh puts it right."""
+    """No role's file is read beyond its limit; the next refresh repairs the store."""
     battle.publish(2)
     name = {'timestamp': 'timestamp.json', 'root': '2.root.json'}.get(role) or f'{battle.newest(role)}.{role}.json'
     battle.write(name, bytes(100 << 20))
@@ -266,9 +266,9 @@ def test_endless_files_are_read_to_their_maximum_size_only(battle: Battle, role:
 @pytest.mark.seaweedfs
 @pytest.mark.long('a real store')
 def test_a_slow_store_delays_only_its_own_request(seaweed: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A byte now and then holds one look at the store, and nothing else: no rollback, and no word on what has expired.
+    """A store that sends single bytes blocks one sync, but neither a rollback nor the report of expired metadata.
 
-    When the connection is gone the next look continues where it was.
+    When the connection has ended, the next sync succeeds.
     """
     monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     bucket_of(seaweed)
@@ -308,7 +308,7 @@ def _raised(act: Callable[[], object]) -> list[BaseException]:
 
 
 class TricklingFront:
-    """Passes connections on to a server, whose answers come in single bytes from the second kilobyte on."""
+    """A proxy that sends answers in single bytes after the first 2 kB."""
 
     def __init__(self, to: int) -> None:
         self._to = to
@@ -358,7 +358,7 @@ class TricklingFront:
 
 
 def test_a_robot_of_another_team_accepts_nothing(battle: Battle) -> None:
-    """A robot of another team takes nothing from this one, and the other way round."""
+    """Nor can another team sign in this store."""
     other = Spark(battle.path / 'other')
     folder = PolicyFolder(battle.path / 'tachi')
     other.trusted_by(folder)
@@ -371,7 +371,7 @@ def test_a_robot_of_another_team_accepts_nothing(battle: Battle) -> None:
 
 
 def test_junk_in_the_place_of_the_next_root_is_removed_by_a_signer(battle: Battle) -> None:
-    """However much of it there is, the next signer removes what hinders robots, and a new root passes through."""
+    """The next signer removes invalid metadata that would block robots, and a new root can be published."""
     for number in range(2, 20):
         battle.write(f'{number}.root.json', b'{}' if number % 2 else b'[' * 50_000)
         battle.write(f'{number}.targets.json', b'junk')
@@ -384,11 +384,11 @@ def test_junk_in_the_place_of_the_next_root_is_removed_by_a_signer(battle: Battl
     assert battle.publish(3) == battle.taken()
 
 
-# -- who has stolen a key --------------------------------------------------------------------------------------------------------
+# -- an attacker with a key ------------------------------------------------------------------------------------------------------
 
 
 def test_a_stolen_online_key_lists_nothing(battle: Battle) -> None:
-    """It can hold a robot, and count far ahead; a new one ends both."""
+    """It can freeze a robot and raise versions to the maximum; a new key ends both."""
     thief = battle.stolen()
     number = battle.newest('targets')
     thief.online(FAR, battle.read(f'{number}.targets.json'), number)
@@ -402,9 +402,9 @@ def test_a_stolen_online_key_lists_nothing(battle: Battle) -> None:
 
 
 def test_stolen_targets_and_online_keys_are_replaced_without_a_visit(battle: Battle) -> None:
-    """The thief's version runs until the keys are replaced, which touches no robot: the robot then goes back, and follows again.
+    """The thief's version runs until the keys are replaced, which touches no robot; then the robot runs the team's version again.
 
-    The thief has counted up to the end everywhere: fast-forward of all metadata, and of the policy's own versions.
+    The thief has raised all versions to the maximum: those of the metadata and of the policy.
     """
     thief = battle.stolen()
     first, evil = battle.folder.current(), thief.evil()
@@ -424,7 +424,7 @@ def test_stolen_targets_and_online_keys_are_replaced_without_a_visit(battle: Bat
 
 
 def test_after_a_stolen_targets_key_is_replaced_only_the_teams_versions_are_listed(battle: Battle) -> None:
-    """It was signed well, so robots take it; new keys list what was signed in the team's own folder, and no more."""
+    """Robots accept the thief's signed version; new keys list only what was signed in the team's own folder."""
     thief = battle.stolen()
     first, evil = battle.folder.current(), thief.evil()
     number = battle.newest('targets') + 1
@@ -438,7 +438,7 @@ def test_after_a_stolen_targets_key_is_replaced_only_the_teams_versions_are_list
 
 
 def test_a_stolen_delegated_key_signs_only_its_policies(battle: Battle) -> None:
-    """It can list only versions of its policies, and none after its delegation ended; that of another key is unchanged."""
+    """It lists only versions of the delegated policies, and none after it was revoked; other delegations are unchanged."""
     battle.stolen()
     signing, people = battle.spark.signing(battle.store), battle.path / 'people'
     people.mkdir()
@@ -459,7 +459,7 @@ def test_a_stolen_delegated_key_signs_only_its_policies(battle: Battle) -> None:
     )
     battle.write(f'2.{bob}.json', Thief(battle, people).signed(by_bob, 'bob'))
     signing.refresh()
-    battle.registry.say('champion', 4)
+    battle.registry.set_alias('champion', 4)
     assert battle.refused() == 'unlisted', 'it is signed by bob, who may not'
     signing.end_delegation('alice')
     assert battle.robot.run().done == 'withdrawn'
@@ -471,7 +471,7 @@ def test_a_stolen_delegated_key_signs_only_its_policies(battle: Battle) -> None:
 
 
 def test_no_key_but_the_root_revokes_another_key(battle: Battle) -> None:
-    """No key but the root's takes another one's right, whatever it signs: neither a root, nor a list with other delegations."""
+    """A delegated key can revoke no other key, neither with a new root nor with a list that delegates."""
     thief = battle.stolen()
     signing, people = battle.spark.signing(battle.store), battle.path / 'people'
     people.mkdir()
@@ -505,12 +505,12 @@ def test_no_key_but_the_root_revokes_another_key(battle: Battle) -> None:
 
 
 def test_a_stolen_root_needs_a_visit_to_each_robot(battle: Battle) -> None:
-    """It needs a visit: a robot that is given the root of new keys takes what these sign, and nothing that the old ones did."""
+    """With the new root on the robot, it accepts versions signed with the new keys and none signed with the old ones."""
     battle.spark.signing(battle.store).refresh()
     thief = battle.stolen()
     for entry in battle.saved():
         battle.store.delete(BUCKET, f'{METADATA}/{entry}')
-    battle.spark = Spark(battle.path / 'anew')
+    battle.spark = Spark(battle.path / 'new')
     battle.spark.trusted_by(battle.folder)
     second = battle.publish(2)
     assert battle.robot.run().done == 'withdrawn', 'what the old keys listed'
@@ -520,7 +520,7 @@ def test_a_stolen_root_needs_a_visit_to_each_robot(battle: Battle) -> None:
 
 
 def test_a_root_below_its_threshold_changes_nothing(battle: Battle, tmp_path: Path) -> None:
-    """One stolen part of a root of two changes nothing; two honest ones replace it, and the robots follow."""
+    """One stolen root key of two required ones changes nothing; two honest ones replace it, and robots follow."""
     people = tmp_path / 'people'
     people.mkdir()
     for name in ('alice', 'bob', 'carol', 'dora'):
@@ -558,7 +558,7 @@ def test_a_root_below_its_threshold_changes_nothing(battle: Battle, tmp_path: Pa
 
 
 def test_with_a_clock_that_was_never_set_nothing_new_is_accepted(battle: Battle) -> None:
-    """In 1970 nothing seems to expire: the robot takes nothing new and says why, and still gives up what was withdrawn."""
+    """In 1970 nothing seems expired: the robot accepts nothing new and reports the clock, but still drops withdrawn versions."""
     battle.robot.wall_ns = lambda: 10**9
     second = battle.publish(2)
     with pytest.raises(PolicyRefused, match='the clock of this robot is wrong: it shows 1970-01-01'):
@@ -573,7 +573,7 @@ def test_with_a_clock_that_was_never_set_nothing_new_is_accepted(battle: Battle)
 
 
 def test_a_signer_whose_clock_is_ahead_is_corrected_by_the_next_signature(battle: Battle) -> None:
-    """Robots then take their own clocks for wrong; the next signature by a right clock ends that."""
+    """Robots report their own clocks as wrong until the next signature with a correct clock."""
     signing = battle.spark.signing(battle.store)
     state = signing.refresh()
     ahead = deepcopy(state.timestamp)

@@ -32,7 +32,7 @@ def test_every_bundled_component_has_a_version_a_license_and_a_hash(supply_chain
 
 
 def test_a_bill_of_materials_names_its_subject(supply_chain: Any, tmp_path: Path) -> None:
-    """Of this package and its version, beside what its tool says of itself."""
+    """This package with its version, in addition to what the tool adds."""
     target = tmp_path / 'a.cdx.json'
     supply_chain.write(target, {'bomFormat': 'CycloneDX', 'metadata': {'tools': {'components': []}}, 'components': []})
     told = json.loads(target.read_text())['metadata']

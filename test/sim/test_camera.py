@@ -25,7 +25,7 @@ def _frame(front: Camera, t: float, caption: str = '') -> np.ndarray:
 
 @pytest.mark.long('every pixel')
 def test_every_pixel_is_redrawn(front: Camera) -> None:
-    """A frame depends on the time alone: what was drawn before shows nowhere."""
+    """A frame depends only on the time: nothing of the frame before is visible."""
     first = {t: _frame(front, t) for t in np.arange(0, 60, 5.9)}
     for t in reversed(list(first)):
         assert np.array_equal(_frame(front, t), first[t])
@@ -33,7 +33,7 @@ def test_every_pixel_is_redrawn(front: Camera) -> None:
 
 @pytest.mark.long('every pixel')
 def test_no_two_frames_are_alike(front: Camera) -> None:
-    """The number in the caption tells frames apart even where the view is the same."""
+    """The number in the caption distinguishes frames even if the view is the same."""
     assert not np.array_equal(_frame(front, 3.0, '#000001'), _frame(front, 3.0, '#000002'))
     assert not np.array_equal(_frame(front, 3.0), _frame(front, 3.0333))
 
@@ -58,17 +58,17 @@ def test_walls_are_where_the_pinhole_model_puts_them(front: Camera) -> None:
 
 @pytest.mark.long('every pixel')
 def test_rooms_look_different(front: Camera) -> None:
-    """Mean colors of frames from different rooms are well apart, so that a picture tells where it was taken."""
+    """Mean colors of frames from different rooms differ clearly, so that a frame shows where it was taken."""
     means: dict[str, list[np.ndarray]] = {}
     for t in np.arange(0, 59, 1.5):
         means.setdefault(front.world.room(float(t)), []).append(_frame(front, float(t)).reshape(-1, 3).mean(axis=0))
-    centres = [np.mean(values, axis=0) for values in means.values()]
-    apart = [np.linalg.norm(a - b) for i, a in enumerate(centres) for b in centres[:i]]
+    centers = [np.mean(values, axis=0) for values in means.values()]
+    apart = [np.linalg.norm(a - b) for i, a in enumerate(centers) for b in centers[:i]]
     assert min(apart) > 8
 
 
 def test_a_frame_compresses_to_the_size_of_a_real_one(front: Camera) -> None:
-    """Quality 80 gives 15 to 70 KB, and what is decoded is the picture."""
+    """Quality 80 gives 15 to 70 KB, and decoding returns the frame."""
     for t in np.arange(0, 60, 7.1):
         image = _frame(front, float(t), 'CAPTION')
         data = simplejpeg.encode_jpeg(image, 80, 'BGR', '420')
@@ -85,7 +85,7 @@ def test_the_pixels_are_packed_blue_green_red() -> None:
 
 
 def test_text_is_cut_at_the_edge_and_unknown_characters_are_blank() -> None:
-    """A caption that is too long spoils nothing, and no character raises."""
+    """A caption that is too long is cut, and no character raises."""
     image = np.zeros((20, 50, 3), np.uint8)
     glyphs.write(image, 'A\u00e9' * 100, 4, 2, (1, 2, 3))
     assert image[2 : 2 + glyphs.HEIGHT, 4 : 4 + glyphs.ADVANCE].any()

@@ -1,4 +1,4 @@
-"""The demo: its audit on spools made here, its words, its folder; and a short one from end to end."""
+"""The demo: its audit of prepared spools, its output, its folder; and a short demo from end to end."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ READING = SpoolReading(30.0, 12_345, 412, 398, 14, 25_300_000, 'corridor', 'away
 
 
 class Scene:
-    """A spool and a store as a run leaves them: two camera frames and a batch of three IMU samples, all delivered."""
+    """A spool and a store after a run: two camera frames and a batch of three IMU samples."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -98,7 +98,7 @@ def good(scene: Scene) -> Scene:
 
 
 def test_an_audit_of_a_good_run_has_no_problems(good: Scene) -> None:
-    """Objects and samples are counted, messages before the match are told apart, an unlogged topic is not a problem."""
+    """Objects and samples are counted, messages before the match separately; an unlogged topic is not a problem."""
     found = good.audit()
     assert found.problems == ()
     assert (found.read_back, found.samples, found.rows) == (4, 5, 3)
@@ -119,7 +119,7 @@ def test_an_object_that_changed_is_found(good: Scene) -> None:
 
 
 def test_a_missing_delivered_object_is_found(scene: Scene) -> None:
-    """What the spool believes delivered and the bucket does not have is named, and its samples are missing."""
+    """An object that the spool counts as delivered but the bucket lacks is named, and its samples are missing."""
     for item in scene.items[1:]:
         scene.deliver(item)
     settle(scene.spool, scene.items[0], State.DELIVERED)
@@ -132,7 +132,7 @@ def test_a_missing_delivered_object_is_found(scene: Scene) -> None:
 
 
 def test_an_object_without_a_row_is_found(good: Scene) -> None:
-    """What the catalog does not have, or has twice, is named by its key."""
+    """An object that the catalog lacks, or has twice, is named by its key."""
     late, twice = 'thor/imu/20251018/120009_imu.json', 'thor/camera/20251018/120000_front.jpg'
     good.deliver(good.spool.commit([an_object(late, b'{"samples": []}', IMU, samples=0)])[0])
     body = encode([row_of('sensor-data', twice, 3, 'image/jpeg', {'robot': 'thor'})])
@@ -142,13 +142,13 @@ def test_an_object_without_a_row_is_found(good: Scene) -> None:
 
 
 def test_a_message_after_the_last_received_one_is_found(good: Scene) -> None:
-    """The ledger cannot know of messages that were lost at the very end; the robot's own account does."""
+    """The ledger has no information about messages lost at the very end; the robot's own count does."""
     good.published[IMU] = 5
     assert good.audit().problems == (f'{IMU}: 2 of 5 messages are not in the ledger',)
 
 
 def test_undelivered_objects_are_a_problem(scene: Scene) -> None:
-    """Objects that wait in the spool are counted, and so are missed messages."""
+    """Pending objects are counted, and so are missed messages."""
     with scene.spool.accounts.entry(IMU) as account:
         account.receive('q', 6)
         account.skipped += 1
@@ -159,16 +159,16 @@ def test_undelivered_objects_are_a_problem(scene: Scene) -> None:
     assert '4 objects are pending' in problems
 
 
-def said(found: DemoAudit, record: Record) -> str:
+def printed(found: DemoAudit, record: Record) -> str:
     output = io.StringIO()
     demo_report.show_result(found, record, Console(file=output, width=80, highlight=False))
     return output.getvalue()
 
 
 def test_the_result_fits_into_80_columns(good: Scene) -> None:
-    """Every topic and key is whole, and every line of the result has its place."""
+    """Topics and keys are not cut, and each part of the result is printed."""
     record = Record(good.published, (replace(READING, t=40.0, pending=0),), (25.0, 35.0))
-    text = said(good.audit(), record)
+    text = printed(good.audit(), record)
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
     assert '10 messages were published before the node found their publishers' in text
     assert f'{RAW} is not logged' in text
@@ -178,15 +178,15 @@ def test_the_result_fits_into_80_columns(good: Scene) -> None:
 
 
 def test_the_result_names_the_problems(good: Scene) -> None:
-    """A problem is never called well."""
+    """With a problem the objects are not reported as spooled."""
     good.published[IMU] = 5
-    text = said(good.audit(), Record(good.published, (READING,), None))
+    text = printed(good.audit(), Record(good.published, (READING,), None))
     assert 'all as spooled' not in text
     assert f'{IMU}: 2 of 5 messages are not in the ledger' in text
 
 
 def test_catching_up_is_measured_from_the_return() -> None:
-    """The backlog is gone when a tenth of it is left; None when it never went."""
+    """The backlog counts as sent when a tenth of it remains; None if that never happened."""
     waiting = [(0.0, 2), (10.0, 0), (20.0, 50), (30.0, 80), (31.0, 60), (33.0, 8), (34.0, 0)]
     readings = tuple(replace(READING, t=t, pending=pending) for t, pending in waiting)
     assert Record({}, readings, (12.0, 30.0)).backlog == 80
@@ -195,7 +195,7 @@ def test_catching_up_is_measured_from_the_return() -> None:
 
 
 def test_progress_without_a_terminal_is_a_line_every_five_seconds() -> None:
-    """And one at each change of the Tower, and the last one."""
+    """Also when the Tower changes its state, and at the end."""
     output = io.StringIO()
     with demo_report.progress(Console(file=output, width=80), 20.0) as show:
         for tenth in range(123):
@@ -205,7 +205,7 @@ def test_progress_without_a_terminal_is_a_line_every_five_seconds() -> None:
 
 
 class FakeTower:
-    """Notes what is asked of it."""
+    """Records its calls."""
 
     def __init__(self) -> None:
         self.calls: list[str] = []
@@ -218,14 +218,14 @@ class FakeTower:
 
 
 def look_until(outage: StoreOutage, t: float, state: str, *, is_last: bool = False) -> None:
-    """The outage's own thread needs a moment to report; pytest's timeout is the deadline."""
+    """Poll until the outage's thread has reached the state; pytest's timeout is the deadline."""
     while outage.state != state:
         outage.poll(t, is_last=is_last)
 
 
 @pytest.mark.timeout(60)
 def test_the_s3_server_stops_once_and_restarts() -> None:
-    """It goes at its time, stays away for its length, and its span is remembered."""
+    """It stops at its time for its duration, and the span is recorded."""
     tower = FakeTower()
     with StoreOutage(tower, 25.0, 10.0) as outage:  # type: ignore[arg-type]
         outage.poll(24.9)
@@ -241,7 +241,7 @@ def test_the_s3_server_stops_once_and_restarts() -> None:
 
 @pytest.mark.timeout(60)
 def test_the_s3_server_restarts_before_the_end_of_any_demo() -> None:
-    """When the robot has stopped the outage is over, so that everything can be delivered."""
+    """When the robot has stopped, the outage ends, so that everything can be delivered."""
     tower = FakeTower()
     with StoreOutage(tower, 1.0, 1000.0) as outage:  # type: ignore[arg-type]
         look_until(outage, 2.0, 'away')
@@ -250,7 +250,7 @@ def test_the_s3_server_restarts_before_the_end_of_any_demo() -> None:
 
 
 def test_the_demo_does_not_reach_a_real_robot_or_tower(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Variables of the shell that name a Tower, a robot or peers do not reach the node; the domain is our own."""
+    """Variables of the shell that name a Tower, a robot or peers are not passed to the node; the domain is another one."""
     foreign = {'AWS_ENDPOINT_URL': 'http://real', 'AWS_SESSION_TOKEN': 't', 'SHADOWHOUND_ROBOT': 'tachi', 'ROS_DOMAIN_ID': '7',
                'ROS_STATIC_PEERS': '10.0.0.1', 'MLFLOW_TRACKING_URI': 'http://real', 'SHADOWHOUND_HOME': '/real'}  # fmt: skip
     for name, value in foreign.items():
@@ -262,16 +262,16 @@ def test_the_demo_does_not_reach_a_real_robot_or_tower(monkeypatch: pytest.Monke
 
 
 def test_a_domain_that_is_in_use_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A domain whose first port is bound on this machine belongs to somebody."""
+    """A domain is in use if its first port is bound on this machine."""
     taken = demo_processes.free_domain()
     monkeypatch.setattr('random.sample', lambda domains, _: [taken, *(domain for domain in domains if domain != taken)])
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
-        somebody.bind(('', 7400 + 250 * taken + 10))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as user:
+        user.bind(('', 7400 + 250 * taken + 10))
         assert demo_processes.free_domain() in set(demo_processes.DOMAINS) - {taken}
 
 
 def test_a_folder_of_an_earlier_demo_is_replaced(tmp_path: Path) -> None:
-    """Its content is gone, the folder itself is there."""
+    """Its content is deleted, the folder is kept."""
     folder = tmp_path / 'demo'
     with demo.fresh_folder(folder):
         (folder / 'home').mkdir()
@@ -282,7 +282,7 @@ def test_a_folder_of_an_earlier_demo_is_replaced(tmp_path: Path) -> None:
 
 
 def test_a_foreign_folder_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Exit code 2, a line that says so, and nothing is touched."""
+    """Exit code 2 and an error; nothing in it is changed."""
     (tmp_path / 'thesis.tex').touch()
     assert demo.main(['--folder', str(tmp_path)]) == 2
     assert 'was not created by a demo' in capsys.readouterr().err
@@ -290,7 +290,7 @@ def test_a_foreign_folder_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_two_demos_do_not_share_a_folder(tmp_path: Path) -> None:
-    """The second is refused and leaves the first one's data alone."""
+    """The second one fails without changing the first one's data."""
     with demo.fresh_folder(tmp_path / 'demo') as folder:
         (folder / 'data').touch()
         with pytest.raises(demo.FolderRefused, match='another demo is running'), demo.fresh_folder(folder):
@@ -302,15 +302,15 @@ def test_two_demos_do_not_share_a_folder(tmp_path: Path) -> None:
     'arguments', [['--duration', '1'], ['--outage', '-1'], ['--duration', '10', '--outage', '6'], ['--duration', 'nan']]
 )
 def test_times_that_make_no_sense_are_refused(arguments: list[str], tmp_path: Path) -> None:
-    """Exit code 2 before anything is made."""
+    """Exit code 2, and no folder is created."""
     assert demo.main([*arguments, '--folder', str(tmp_path / 'demo')]) == 2
     assert not (tmp_path / 'demo').exists()
 
 
 def test_errors_of_the_node_are_reported(good: Scene) -> None:
-    """How many, and the first of them, as it stands in the log."""
+    """With their number and the first of them, verbatim."""
     record = Record(good.published, (READING,), None, ('[ERROR] [1.0] [sensor_logger]: intake failed', 'another'))
-    text = said(good.audit(), record)
+    text = printed(good.audit(), record)
     assert 'Errors that the node logged: 2' in text
     assert '[ERROR] [1.0] [sensor_logger]: intake failed' in text
     assert 'another' not in text
@@ -321,7 +321,7 @@ def test_errors_of_the_node_are_reported(good: Scene) -> None:
     ['[ERROR] [1.1] [sensor_logger]: intake failed', '[FATAL] [1.1] [sensor_logger]: no', 'Traceback (most recent call last):'],
 )
 def test_a_node_that_logged_an_error_is_reported(tmp_path: Path, line: str) -> None:
-    """However well the ledger balances: each line counts, and lines that only speak of errors do not."""
+    """Each error in its log counts; a line that only mentions one does not."""
     log = tmp_path / 'node.log'
     with demo_processes.Child('platform', [], os.environ, log) as child:
         until(lambda: not child.is_running)
@@ -331,7 +331,7 @@ def test_a_node_that_logged_an_error_is_reported(tmp_path: Path, line: str) -> N
 
 
 def test_a_child_is_asked_to_stop_once(tmp_path: Path) -> None:
-    """Python that ends dies of a SIGINT, as its handler is gone: a child that did its work would seem to have failed."""
+    """A second SIGINT would kill a Python that is exiting and has no handlers any more: the child would count as failed."""
     module = tmp_path / 'slow_to_end.py'
     module.write_text("""
 import signal, threading
@@ -354,8 +354,8 @@ stop.wait()
         child.check()
 
 
-def asked(address: str, path: str) -> bytes:
-    """What the live page answers."""
+def get(address: str, path: str) -> bytes:
+    """A response of the live page."""
     with build_opener(ProxyHandler({})).open(address + path, timeout=90) as answer:
         assert answer.status == 200
         return bytes(answer.read())
@@ -365,9 +365,9 @@ def asked(address: str, path: str) -> bytes:
 @pytest.mark.ros
 @pytest.mark.seaweedfs
 def test_a_short_demo_succeeds(tmp_path: Path) -> None:
-    """With a real Tower, the real node, a mission and the simulated robot: exit code 0, a ledger that balances, four pictures.
+    """With a real Tower, the real node, a mission and the simulated robot: exit code 0, a ledger that balances, four images.
 
-    The page is there while the robot walks, and with --keep afterwards until Ctrl-C; a Chromium takes a fifth picture, of it.
+    The live page is served while the robot walks, and with --keep until Ctrl-C; Chromium takes a fifth image, of the page.
     """
     pytest.importorskip('rclpy')
     folder = tmp_path / 'demo'
@@ -379,39 +379,39 @@ def test_a_short_demo_succeeds(tmp_path: Path) -> None:
         stack.callback(run.communicate)
         stack.callback(run.kill)
         assert run.stdout is not None
-        said = ''
+        output = ''
 
-        def heard(words: str) -> str:
-            """All that it says, up to the line with these."""
-            nonlocal said
+        def read_until(words: str) -> str:
+            """The output up to the line with these words."""
+            nonlocal output
             assert run.stdout is not None
-            while words not in said and (line := run.stdout.readline()):
-                said += line
-            assert words in said, said + (tmp_path / 'errors').read_text()
-            return said
+            while words not in output and (line := run.stdout.readline()):
+                output += line
+            assert words in output, output + (tmp_path / 'errors').read_text()
+            return output
 
-        address = heard('Watch it live').split()[-1]
+        address = read_until('Watch it live').split()[-1]
         walking = folder / 'sim.out'
         until(walking.exists, 60.0)
-        assert json.loads(asked(address, 'api/session'))['robot'] == 'thor'
+        assert json.loads(get(address, 'api/session'))['robot'] == 'thor'
         assert '"published"' not in walking.read_text(), 'the robot walks no more'
 
-        assert address in heard('Ctrl-C stops it').split()[-20:]
-        assert 'doctor' in json.loads(asked(address, 'api/doctor'))  # which takes it seconds
-        assert b'<html' in asked(address, '')
+        assert address in read_until('Ctrl-C stops it').split()[-20:]
+        assert 'doctor' in json.loads(get(address, 'api/doctor'))  # takes seconds
+        assert b'<html' in get(address, '')
         run.send_signal(signal.SIGINT)
-        said += run.stdout.read()
-        assert run.wait(200) == 0, said + (tmp_path / 'errors').read_text()
-    assert 'The ledger balances' in said
-    assert 'all as spooled' in said
-    assert 'DOWN' in said
-    assert 'The mission patrol_' in said
+        output += run.stdout.read()
+        assert run.wait(200) == 0, output + (tmp_path / 'errors').read_text()
+    assert 'The ledger balances' in output
+    assert 'all as spooled' in output
+    assert 'DOWN' in output
+    assert 'The mission patrol_' in output
     assert (tmp_path / 'errors').read_text() == ''
     assert json.loads((folder / 'ledger.json').read_text())['balanced'] is True
-    pictures = ['frames.png', 'patrol.png', 'delivery.png', 'mission.png']
+    images = ['frames.png', 'patrol.png', 'delivery.png', 'mission.png']
     if CHROMIUM is not None and find_spec('playwright') is not None:
-        pictures.append('live.jpg')
-    for name in pictures:
+        images.append('live.jpg')
+    for name in images:
         with Image.open(folder / name) as plot:
             assert min(plot.size) > 200
-        assert str(folder / name) in said
+        assert str(folder / name) in output

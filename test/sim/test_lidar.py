@@ -34,7 +34,7 @@ def test_every_point_is_on_a_surface(lidar: Lidar, t: float) -> None:
 
 @pytest.mark.parametrize('t', TIMES)
 def test_no_object_is_between_sensor_and_point(lidar: Lidar, t: float) -> None:
-    """The straight way to each point leads through no box, but for its last centimetres."""
+    """The ray to each point passes through no box, except in its last centimeters."""
     points = lidar.scan(t)[::41, :3].astype(np.float64)
     origin = np.array(lidar.origin(lidar.world.pose(t)))
     bounds = lidar.world.plan.bounds.astype(np.float64)
@@ -58,7 +58,7 @@ def test_a_scan_has_the_size_it_has_in_the_field(lidar: Lidar) -> None:
 
 
 def test_scans_are_in_the_frame_odom(lidar: Lidar) -> None:
-    """What is seen from two places falls on the same walls: the outer walls stand still while the robot walks."""
+    """Scans from two places agree on the walls: the outer walls do not move while the robot walks."""
     for t in (3.0, 30.0):
         cloud = lidar.scan(t)
         x0, y0 = lidar.world.plan.corner
@@ -69,7 +69,7 @@ def test_scans_are_in_the_frame_odom(lidar: Lidar) -> None:
 
 
 def test_scans_repeat_with_the_seed_and_differ_with_time() -> None:
-    """A scan depends on seed and time alone."""
+    """A scan depends only on seed and time."""
     one, two, other = Lidar(World.of(5)), Lidar(World.of(5)), Lidar(World.of(6))
     one.scan(1.0)
     assert np.array_equal(one.scan(8.1), two.scan(8.1))

@@ -39,7 +39,7 @@ GO2 = {'imu': 100, 'go2_states': 20, 'lowstate': 20}
 RATES = {**COMMON, **GO2} if find_spec('go2_interfaces') else COMMON
 BEST_EFFORT = {'camera/image_raw', 'camera/camera_info', 'point_cloud2'}
 SECONDS = 5
-"""Long enough for Fast DDS to find the publisher by its second announcement, 3 s after a first one that went amiss."""
+"""Long enough for Fast DDS to find the publisher by its second announcement, 3 s after the first, if that was lost."""
 
 
 def environment(domain: int, **more: str) -> dict[str, str]:
@@ -108,7 +108,7 @@ class Listener:
 
 
 class Run:
-    """Some seconds of the simulated Go2 as /tachi: what it said, what a listener got, what the graph showed."""
+    """Some seconds of the simulated Go2 as /tachi: its output, what a listener received, and its endpoints in the graph."""
 
     def __init__(self, domain: int) -> None:
         listener = Listener(domain)
@@ -160,7 +160,7 @@ def finished(domain: int, *parameters: str, **more: str) -> subprocess.Completed
 @pytest.mark.ros
 @pytest.mark.long('a second of CPU or more')
 def test_it_publishes_exactly_rate_times_duration(some_seconds: Run) -> None:
-    """The line of JSON names every topic, resolved, with the exact number, and the exit code is 0."""
+    """The line of JSON has every resolved topic with the exact number, and the exit code is 0."""
     assert some_seconds.returncode == 0
     assert some_seconds.published == {f'/tachi/{name}': SECONDS * rate for name, rate in RATES.items()}
 
@@ -169,7 +169,7 @@ def test_it_publishes_exactly_rate_times_duration(some_seconds: Run) -> None:
 @pytest.mark.long('a robot at full rate')
 @pytest.mark.parametrize('name', sorted(set(RATES) - BEST_EFFORT))
 def test_reliable_topics_arrive_without_a_gap(some_seconds: Run, name: str) -> None:
-    """From the first message taken to the very last one published, none is missing."""
+    """No message is missing from the first one taken to the last one published."""
     taken, published = some_seconds.listener.taken[name], some_seconds.published[f'/tachi/{name}']
     assert taken
     numbers = [info.get('publication_sequence_number') for _, info in taken]
@@ -180,7 +180,7 @@ def test_reliable_topics_arrive_without_a_gap(some_seconds: Run, name: str) -> N
 @pytest.mark.ros
 @pytest.mark.parametrize('name', sorted(RATES))
 def test_the_qos_is_the_drivers(some_seconds: Run, name: str) -> None:
-    """BEST_EFFORT where the real driver has it, RELIABLE elsewhere, never latched."""
+    """BEST_EFFORT for the topics of the real driver that use it, otherwise RELIABLE; always VOLATILE."""
     profile = some_seconds.endpoints[name].qos_profile
     assert profile.reliability.name == ('BEST_EFFORT' if name in BEST_EFFORT else 'RELIABLE')
     assert profile.durability.name == 'VOLATILE'
@@ -210,7 +210,7 @@ def test_image_and_jpeg_are_one_frame(some_seconds: Run) -> None:
 
 @pytest.mark.ros
 def test_stamps_are_the_time_of_the_sample_in_utc(some_seconds: Run) -> None:
-    """Odometry is stamped every 20 ms, the last 20 ms before the time is over."""
+    """Odometry is stamped every 20 ms until the end."""
     listener = some_seconds.listener
     odometry = [deserialize_message(cdr, listener.types['odom']).header.stamp for cdr, _ in listener.taken['odom']]
     stamps = [stamp.sec * 10**9 + stamp.nanosec for stamp in odometry]
@@ -238,7 +238,7 @@ def test_messages_look_like_the_drivers(some_seconds: Run) -> None:
 @pytest.mark.ros
 @pytest.mark.skipif('imu' not in RATES, reason='needs go2_interfaces')
 def test_the_go2_messages_belong_together(some_seconds: Run) -> None:
-    """The battery is that of the first seconds, motors stand in the robot's order, velocity is walking speed."""
+    """The battery is almost full, motors are in the robot's order, and the velocity is walking speed."""
     listener = some_seconds.listener
     low, state, imu, joints = (listener.last(name) for name in ('lowstate', 'go2_states', 'imu', 'joint_states'))
     assert low.bms_state.soc == 99
@@ -290,7 +290,7 @@ def _wait_for_publisher(process: subprocess.Popen[str], domain: int) -> bool:
 @pytest.mark.ros
 @pytest.mark.long('a robot of its own')
 def test_without_go2_interfaces_it_runs_with_the_rest(tmp_path: Path, domain: int) -> None:
-    """The topics of go2_interfaces are missing, all others are there, and one line on stderr says so."""
+    """Only the topics of go2_interfaces are missing, which one line on stderr reports."""
     missing = tmp_path / 'go2_interfaces'
     missing.mkdir()
     (missing / '__init__.py').write_text('raise ImportError("not installed here")')
@@ -331,7 +331,7 @@ def test_a_stray_argument_refuses_the_start(domain: int) -> None:
     [(100.0, 60.0, 6000), (30.0, 0.1, 3), (0.1, 30.0, 3), (3.0, 1 / 3, 1), (30.0, 0.11, 4), (10.0, 0.05, 1)],
 )
 def test_the_number_of_samples_is_rate_times_duration(rate: float, duration: float, expected: int) -> None:
-    """A whole product is exactly that many, whatever floating point makes of it; the rest of a period counts as one."""
+    """An integer product is exact in spite of floating point; a partial period counts as one."""
     assert count(rate, duration) == expected
 
 
@@ -340,7 +340,7 @@ def test_the_number_of_samples_is_rate_times_duration(rate: float, duration: flo
     st.floats(0.01, 5),
 )
 def test_every_sample_comes_once_and_in_order(rates: dict[str, float], duration: float) -> None:
-    """Times never go back, stay below the duration, and are the multiples of each period."""
+    """Times never decrease, stay below the duration, and are multiples of each period."""
     due = list(schedule(rates, duration))
     assert all(a[0] <= b[0] for a, b in pairwise(due))
     for name, rate in rates.items():
@@ -349,7 +349,7 @@ def test_every_sample_comes_once_and_in_order(rates: dict[str, float], duration:
 
 
 def test_without_a_duration_it_never_ends_and_never_drifts() -> None:
-    """The millionth sample is due exactly where it belongs."""
+    """Sample 300,000 is due exactly at its time."""
     last = list(islice(schedule({'a': 30.0}, 0.0), 300_001))[-1]
     assert last == (10_000.0, 'a')
 
@@ -372,13 +372,13 @@ def test_a_wrong_value_is_named(name: str, value: object) -> None:
 
 @pytest.mark.ros
 def test_whole_numbers_and_the_parameters_of_rclpy_are_taken() -> None:
-    """``duration_s:=5`` is five seconds, and what rclpy declares by itself is nobody's mistake."""
+    """``duration_s:=5`` is five seconds, and parameters that rclpy declares are not errors."""
     settings = SimSettings.load({'duration_s': 5, 'use_sim_time': False, 'start_type_description_service': True})
     assert settings == SimSettings(duration_s=5.0)
 
 
 class SlowRobot:
-    """Takes a tenth of a second for its first message, longer than all others should take together."""
+    """Takes 0.1 s for its first message, longer than all others together."""
 
     rates_hz = {'a': 1000.0}  # noqa: RUF012
 
@@ -393,7 +393,7 @@ class SlowRobot:
 
 @pytest.mark.ros
 def test_a_late_robot_catches_up_completely() -> None:
-    """After a stall everything that was due is published, each with the time at which it was due."""
+    """After a stall every due sample is published, with the time at which it was due."""
     robot = SlowRobot()
     run(robot, SimSettings(duration_s=0.05), lambda: False)  # type: ignore[arg-type]
     assert [t for t, _ in robot.samples] == [k / 1000 for k in range(50)]
@@ -402,7 +402,7 @@ def test_a_late_robot_catches_up_completely() -> None:
 
 @pytest.mark.ros
 def test_a_stop_takes_effect_before_the_next_message() -> None:
-    """Nothing more is published once it is to stop."""
+    """Nothing is published after a stop was requested."""
     robot = SlowRobot()
     run(robot, SimSettings(), lambda: len(robot.samples) == 3)  # type: ignore[arg-type]
     assert len(robot.samples) == 3

@@ -1,4 +1,4 @@
-"""The simulated robot agrees with itself and with its building."""
+"""The simulated robot's poses, sensors and building are consistent."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def lap(world: World) -> float:
 
 
 def test_the_robot_starts_at_the_origin_of_odom_heading_along_x(world: World) -> None:
-    """The origin of odom is where the robot gets up."""
+    """The origin of odom is the robot's start."""
     motion = world.motion(0.0)
     assert (motion.x, motion.y, motion.yaw) == pytest.approx((0, 0, 0), abs=1e-9)
     assert (motion.vx, motion.vy) == pytest.approx((SPEED, 0))
 
 
 def test_the_patrol_closes_in_about_a_minute(world: World, lap: float) -> None:
-    """A one-minute demo sees the whole building, and the second round is the first."""
+    """A one-minute demo covers the whole building, and the second lap equals the first."""
     assert 50 < lap < 62
     assert world.motion(lap + 12.3) == pytest.approx(world.motion(12.3))
 
 
 def test_the_patrol_visits_every_room(world: World, lap: float) -> None:
-    """One round leads through all rooms and never outside."""
+    """One lap passes through all rooms and never outside."""
     assert {world.room(t) for t in np.arange(0, lap, 0.1)} == {room.name for room in ROOMS}
 
 
@@ -55,7 +55,7 @@ def test_the_body_never_touches_anything(world: World, lap: float) -> None:
 
 
 def test_velocity_is_the_derivative_of_the_pose(world: World, lap: float) -> None:
-    """Position, velocity, heading and rate of turn belong together at every moment."""
+    """Position, velocity, heading and yaw rate are consistent at every moment."""
     for t in np.arange(0.01, lap, 0.173):
         before, now, after = (world.motion(float(t) + d) for d in (-STEP, 0.0, STEP))
         assert (after.x - before.x) / (2 * STEP) == pytest.approx(now.vx, abs=1e-3)
@@ -66,7 +66,7 @@ def test_velocity_is_the_derivative_of_the_pose(world: World, lap: float) -> Non
 
 
 def test_the_gyroscope_reads_the_rate_of_turn(world: World, lap: float) -> None:
-    """Gyro z is the yaw rate but for noise and the trot's sway."""
+    """Gyro z is the yaw rate except for noise and the sway of the trot."""
     for t in np.arange(0, lap, 0.11):
         assert world.imu(float(t)).gyroscope[2] == pytest.approx(world.motion(float(t)).yaw_rate, abs=0.03)
 

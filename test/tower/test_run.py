@@ -135,7 +135,7 @@ def test_no_server_leaves_its_memory_on_the_disk(folder: Path) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason='another user is needed')
 @pytest.mark.parametrize('user', ['nobody', 'postgres'])
 def test_another_service_of_the_machine_reads_nothing_of_mlflow(folder: Path, offset: int, user: str) -> None:
-    """Neither its environment nor its files, as a user shared by services; nor, as the user nobody, the database."""
+    """Neither its environment nor its files, as a user shared by services; nor, as the user ``nobody``, the database."""
     mlflow, sockets = (run_module.unprivileged_folders(folder, offset)[name] for name in ('mlflow', 'sockets'))
     wanted = [str(server / 'environ') for server in _mlflow_processes(offset)]
     wanted += [str(mlflow / name) for name in ('s3.keys', 'auth.ini')]

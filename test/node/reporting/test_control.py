@@ -146,7 +146,7 @@ def test_an_invalid_request_gets_an_error(serve: Callable[..., Serving], line: b
 
 @pytest.mark.parametrize('content', [b'{"do": "' + b'x' * 10_000_000 + b'"}\n', os.urandom(10_000_000).replace(b'\n', b'\r')])
 def test_a_line_has_a_maximum_length(serve: Callable[..., Serving], content: bytes) -> None:
-    """Ten megabytes, or an endless line, are refused as soon as they are too long, and the client is disconnected."""
+    """A longer line is refused while it is read, and the client is disconnected."""
     serving = serve()
     with raw(serving) as client:
         with pytest.raises((BrokenPipeError, ConnectionResetError)):
