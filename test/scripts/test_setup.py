@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ('awk', 'basename', 'cat', 'cut', 'dirname', 'find', 'flock', 'grep', 'ls', 'mkdir', 'printf', 'pwd', 'rm', 'sed', 'sh',
          'sha256sum', 'sort', 'tail', 'uname', 'xargs')  # fmt: skip
 PLACES = {'PATH': 'bin/{}', 'pyenv': 'home/.pyenv/versions/{}.1/bin/python3', 'uv': 'uv/{}/bin/python3'}
@@ -40,7 +40,7 @@ class Machine:
         path = self.folder / PLACES[where].format(f'python{version}' if where == 'PATH' else version)
         claim = f'import sys; sys.version_info = ({version.replace(".", ", ")}, 1)'
         hidden = '' if makes_venvs else "; sys.modules['ensurepip'] = None"
-        _program(path, f"""[ "$1" = -c ] || exit 1\nexec {sys.executable} -c "{claim}{hidden}; $2"\n""")
+        _program(path, f"""[ "$1" = -c ] || exit 1\nexec {sys.executable} -I -S -c "{claim}{hidden}; $2"\n""")
         if where == 'uv':
             known = self.folder / 'known'
             with known.open('a') as file:

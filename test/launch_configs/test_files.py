@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.options import ShutdownSettings
 from shadowhound_data_logger.core.type_rules import RULES
 from shadowhound_data_logger.node.intake.sampling import EveryMessage, rule_for
 
-FOLDER = Path(__file__).parents[1] / 'launch_configs'
+FOLDER = Path(__file__).parents[2] / 'launch_configs'
 
 
 def flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:
@@ -84,7 +84,7 @@ def test_the_full_rate_has_only_changed_parameters() -> None:
     assert same == []
 
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 UNITS = sorted((ROOT / 'launch_configs').glob('*.service'))
 UNIT, LIVE = (ROOT / 'launch_configs' / f'shadowhound-{name}.service' for name in ('data-logger', 'live'))
 CLOSE_S = 5.0
