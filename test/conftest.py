@@ -1,4 +1,4 @@
-"""What tests of several folders share: the embedded Tower, ROS domains, and which tests may run at the same time."""
+"""Shared by tests of several folders: the embedded Tower, ROS domains, and which tests may run at the same time."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ if TYPE_CHECKING:
 
 
 ENDING_S = 60.0
-"""More than enough for threads that were told to end and are not waited for."""
+"""More than enough for threads that were asked to stop and not joined."""
 SERVERS = ('process_request_thread', '_server_entry')
-"""Threads of the stand-in servers (http.server, moto), which end with their clients or the session."""
+"""Threads of the fake servers (http.server, moto), which end with their clients or the session."""
 ENGINE = ('DaftBackgroundEventLoop', 'Dummy-')
-"""Daft's own, of which a process keeps one set; the latter is what Python calls threads of another language."""
-MAX_WORKERS = 6
-"""Each collects all tests and loads all libraries, some 6 s of CPU; many tests wait."""
+"""Daft's threads, which a process keeps; Dummy is Python's name for threads of other languages."""
+MAX_WORKERS = 5
+"""Each collects all tests, loads all libraries and forks programs, which takes 15 s of CPU time; many tests wait."""
 ONE_ROBOT_AT_A_TIME = (
     'test/e2e/test_bag.py', 'test/e2e/test_catalog.py', 'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py',
     'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',
 )  # fmt: skip
-"""Files with robots at full rate, of which nothing may be missed. They come first, after one another, and others make way."""
+"""Files with robots at full rate, which must lose no message: they run first, one after the other, and others yield to them."""
 ONE_SENDER = ('test/e2e/test_guide.py', 'test/missions/test_tracking.py')
-"""Files whose missions one process sends, which has loaded MLflow."""
+"""Files whose missions are sent by one process, which has loaded MLflow."""
 ONE_TEAM = (
     'test/e2e/test_closed_loop.py', 'test/policies/test_trust.py', 'test/e2e/test_policies.py',
     'test/policies/test_sync.py', 'test/e2e/test_policies.py',
 )  # fmt: skip
-"""Files that sign policies on a shared Tower, which serves one team at a time."""
+"""Files that sign policies on a shared Tower, which has one team at a time."""
 WAITING = ('test/doctor/', 'test/e2e/', 'test/missions/', 'test/sim/', 'test/tower/')
 """Folders whose tests mostly wait for other processes."""
-MAKE_WAY = os.nice(0) + 10
-"""How nice the other workers are."""
+NICENESS = os.nice(0) + 10
+"""Of the other workers."""
 HUNG_S = 60.0
-"""After the time of a test is over, for it to end: one that waits in a library for a lock that nobody has ends no other way."""
+"""After a test's timeout, until its process is ended: nothing else ends a test that waits in a library for a lock."""
 STDERR = pytest.StashKey[int]()
-"""While a test runs, what it writes to file 2 is kept for its report."""
+"""A copy of standard error, which pytest captures while a test runs."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """What is started in the background of a shell ignores SIGINT, and so would the programs that tests end by it.
+    """A process in the background of a shell ignores SIGINT, and so would the programs that tests stop with it.
 
-    Nodes of the tests, in this process and in others, are among themselves. In a fresh clone each worker begins to compile the
-    tests at another place, and finds the rest compiled; ``pytest_collection_modifyitems`` restores the order that all must have.
+    Nodes of the tests, in this process and in others, see only this machine. In a fresh clone each worker starts to compile the
+    tests at another folder, and finds the rest compiled; ``pytest_collection_modifyitems`` restores the common order.
     """
     if hasattr(config, 'workerinput') and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         root = Path(__file__).parent
@@ -69,15 +69,15 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[STDERR] = os.dup(2)
     os.environ.update(THIS_MACHINE)
     gc.disable()
-    botocore.session.create_loader = lru_cache(create_loader)  # whose descriptions of S3 each store would read
+    botocore.session.create_loader = lru_cache(create_loader)  # each store would read the description of S3
     profiles.load()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.hookimpl(optionalhook=True)  # pytest-xdist's, which need not be there
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist, which may not be installed
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Several for each core, because most tests wait; none for files by name, which are there sooner without."""
+    """Several per core, because many tests wait; none for files given by name, which are faster without."""
     names = [Path(argument.partition('::')[0]) for argument in config.args]
     if config.args_source is pytest.Config.ArgsSource.ARGS and all(name.is_file() for name in names):
         return 0
@@ -86,7 +86,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """A worker takes whole files, because tests of a file share what is dear to start."""
+    """A worker takes whole files, because their tests share fixtures."""
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):
@@ -98,7 +98,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
             return 'robots' if has_robot(nodeid) else str(super()._split_scope(nodeid))
 
         def remove_node(self, node: Any) -> str | None:
-            """The test that ended a worker is not tried again: it would end one after the other."""
+            """The test that ended a worker is not run again: it would end all workers."""
             units = self.assigned_work[node].values()
             crashed = next(((unit, test) for unit in units for test, is_done in unit.items() if not is_done), None)
             if crashed is not None:
@@ -115,15 +115,15 @@ def has_robot(nodeid: str) -> bool:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The longest group first; with it a worker of its own that is not nice yet. Then what waits between what computes.
+    """The group with robots first, on a worker that is not nice yet; then files that wait between files that compute.
 
-    Long tests only where they are asked for.
+    Long tests are skipped unless requested.
     """
     for item in items:
         if profiles.LONG:
             by_hypothesis = getattr(getattr(item, 'function', None), 'is_hypothesis_test', False)
             if by_hypothesis or item.get_closest_marker('sampled'):
-                item.add_marker(pytest.mark.long('all that it tries'))
+                item.add_marker(pytest.mark.long('all examples'))
         elif marker := item.get_closest_marker('long'):
             item.add_marker(pytest.mark.skip(reason=f'{marker.args[0]}: set SHADOWHOUND_TEST_LONG=1'))
     if hasattr(config, 'workerinput'):
@@ -133,7 +133,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def places(names: Iterable[str]) -> dict[str, float]:
-    """Where a file comes, 0 to 1: those that wait and those that compute are spread evenly, each in their order."""
+    """The position of each file, 0 to 1: files that wait and files that compute are spread evenly, each kind in its order."""
     found: dict[str, float] = {}
     files = list(dict.fromkeys(names))
     for kind in (True, False):
@@ -143,16 +143,16 @@ def places(names: Iterable[str]) -> dict[str, float]:
 
 
 def pytest_collection_finish() -> None:
-    """Four thousand tests and what they import stay for good: looking through all of it again and again takes seconds."""
+    """All tests and their imports stay in memory: collecting that garbage repeatedly would take seconds."""
     gc.enable()
     gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """pytest-timeout interrupts Python; where that does not help, the process tells where each thread is, and ends.
+    """pytest-timeout interrupts Python; if that does not help, the process prints the stack of each thread and exits.
 
-    The others go on: pytest-xdist starts another worker, and the test has failed.
+    Then the test has failed, and pytest-xdist starts another worker.
     """
     marker = item.get_closest_marker('timeout')
     seconds = float(marker.args[0] if marker else item.config.getini('timeout'))
@@ -164,40 +164,40 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """What runs beside a robot leaves it the core, servers and children included."""
-    if hasattr(item.config, 'workerinput') and not has_robot(item.nodeid) and (more := MAKE_WAY - os.nice(0)) > 0:
+    """Tests that run next to a robot, with their servers and children, yield to it."""
+    if hasattr(item.config, 'workerinput') and not has_robot(item.nodeid) and (more := NICENESS - os.nice(0)) > 0:
         os.nice(more)
 
 
 @pytest.fixture(autouse=True)
-def tables_are_made_elsewhere(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Queries of a test keep their tables out of the home of the user who runs it."""
+def tables_are_in_a_temporary_home(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Queries keep their tables out of the user's home."""
     if 'SHADOWHOUND_HOME' not in os.environ:
         monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path_factory.getbasetemp() / 'home'))
 
 
 @pytest.fixture(autouse=True)
 def no_thread_is_left() -> Iterator[None]:
-    """A thread that a test began ends with it."""
+    """A thread that a test started ends with it."""
     before = set(threading.enumerate())
     yield
     end = time.monotonic() + ENDING_S
     while left := [
         thread.name for thread in set(threading.enumerate()) - before if not any(name in thread.name for name in SERVERS + ENGINE)
     ]:
-        assert time.monotonic() < end, f'threads that outlive their test: {left}'
+        assert time.monotonic() < end, f'threads that are still running: {left}'
         time.sleep(0.01)
 
 
 def of_this_run(factory: pytest.TempPathFactory, name: str, users: Mapping[str, Sequence[str]], *, mlflow: bool = False) -> Tower:
-    """A Tower that all workers of the run share; without workers it lives as long as this process."""
+    """A Tower that all workers of the run share; without workers it runs as long as this process."""
     from shared_tower import shared_tower
 
     worker = os.environ.get('PYTEST_XDIST_WORKER')
     base = factory.getbasetemp()
     owner = os.getppid() if worker else os.getpid()
     shared = shared_tower((base.parent if worker else base) / name, users, owner, mlflow=mlflow)
-    return cast('Tower', shared)  # what tests ask of it
+    return cast('Tower', shared)  # with the attributes that tests use
 
 
 @pytest.fixture(scope='session')
@@ -209,7 +209,7 @@ def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Tower:
 
 @pytest.fixture(scope='session')
 def tower(tmp_path_factory: pytest.TempPathFactory) -> Tower:
-    """A running Tower with S3 and MLflow; the latter takes some ten seconds to start."""
+    """A running Tower with S3 and MLflow, which takes some ten seconds to start."""
     from shared_tower import USERS
 
     return of_this_run(tmp_path_factory, 'tower', USERS, mlflow=True)
@@ -217,14 +217,14 @@ def tower(tmp_path_factory: pytest.TempPathFactory) -> Tower:
 
 @pytest.fixture
 def domain() -> Iterator[int]:
-    """A ROS domain that nobody uses, and no other test takes meanwhile."""
+    """An unused ROS domain, locked against other tests."""
     with free_domain() as number:
         yield number
 
 
 @pytest.fixture(scope='module')
 def authorities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Authority]:
-    """One that is trusted, and one that nobody knows."""
+    """A trusted and an unknown one."""
     from tls_front import Authority
 
     folder = tmp_path_factory.mktemp('tls')
