@@ -23,14 +23,20 @@ from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import ledger
 
 
+def fill_disk(it: Desk) -> str:
+    """Record five messages, then fill the disk; returns the bag's name."""
+    name = start(it.recorder)
+    it.hear(range(5))
+    write_out(it)
+    it.room[0] = False
+    write_out(it)
+    return name
+
+
 def test_a_full_disk_loses_only_messages_of_that_time(tmp_path: Path) -> None:
     """The slice is closed and spooled, messages are dropped as no_room, and the recording continues once there is room."""
     with desk(tmp_path) as it:
-        name = start(it.recorder)
-        it.hear(range(5))
-        write_out(it)
-        it.room[0] = False
-        write_out(it)
+        name = fill_disk(it)
         assert it.recorder.status().refused == 'no_room'
         it.hear(range(5, 10))
         it.room[0] = True
@@ -46,11 +52,7 @@ def test_a_full_disk_loses_only_messages_of_that_time(tmp_path: Path) -> None:
 def test_manifest_and_gap_parts_agree(tmp_path: Path) -> None:
     """Messages dropped because of a full disk: the same counts by topic and reason in both."""
     with desk(tmp_path) as it:
-        name = start(it.recorder)
-        it.hear(range(5))
-        write_out(it)
-        it.room[0] = False
-        write_out(it)
+        name = fill_disk(it)
         it.hear(range(5, 10))
         it.hear(range(3), topic='/other')
         it.room[0] = True

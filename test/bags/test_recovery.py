@@ -78,16 +78,21 @@ def test_without_the_index_messages_dropped_after_the_last_slice_are_missing(tmp
     assert states == [('gaps', 5), ('gaps', 5)]
 
 
-def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
-    """Its target is neither read, moved nor removed."""
-    home, outside = tmp_path / 'home', tmp_path / 'outside'
+def killed(home: Path) -> tuple[str, Path]:
+    """The name of a bag with a complete and an open slice, and what remains of its home after a kill."""
     with desk(home, record='always') as it:
         name = it.recorder.status().bag
         it.hear(range(10))
         it.recorder.split()
         it.hear(range(10, 20))
         assert it.writer.flush(60)
-        left = kill(home)
+        return name, kill(home)
+
+
+def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
+    """Its target is neither read, moved nor removed."""
+    home, outside = tmp_path / 'home', tmp_path / 'outside'
+    name, left = killed(home)
     folder = left / 'bags' / ROBOT / name
     shutil.rmtree(folder)
     outside.mkdir()
@@ -104,13 +109,7 @@ def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
 def test_a_row_without_a_folder_is_removed(tmp_path: Path) -> None:
     """Delivered slices are listed, others are unknown, and the row is removed."""
     home = tmp_path / 'home'
-    with desk(home, record='always') as it:
-        name = it.recorder.status().bag
-        it.hear(range(10))
-        it.recorder.split()
-        it.hear(range(10, 20))
-        assert it.writer.flush(60)
-        left = kill(home)
+    name, left = killed(home)
     shutil.rmtree(left / 'bags' / ROBOT / name)
     with desk(left) as it:
         is_whole(it)

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner, Result
-from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
+from lake.making import NOON_NS, add_objects, add_part, content, folder_store, row
 
 from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.fetch import fetch
@@ -25,10 +25,7 @@ TIMES = [NOON_NS + second * SECOND for second in range(5)]
 def home(tmp_path: Path) -> Path:
     """A store with ten objects and their part of the catalog."""
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
-        for sensor in SENSORS:
-            for stamp_ns in TIMES:
-                add(store, tmp_path / 'tmp', row(sensor, stamp_ns)['key'], content(sensor, stamp_ns))
-        add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES], 'part', tmp_path / 'tmp')
+        add_objects(store, TIMES, tmp_path / 'tmp')
     return tmp_path
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import click
 import pytest
 from click.testing import CliRunner, Result
-from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
+from lake.making import NOON_NS, SENSORS, add, add_objects, add_part, folder_store, row
 
 from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.lake import lake
@@ -32,12 +32,9 @@ PATH = 'thor/patrol_20261028_120000.csv'
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Ten objects, one in another bucket, and two parts of the catalog."""
+    """Ten objects, one in another bucket, and three parts of the catalog."""
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
-        for sensor in SENSORS:
-            for stamp_ns in TIMES:
-                add(store, tmp_path / 'tmp', row(sensor, stamp_ns)['key'], content(sensor, stamp_ns))
-            add_part(store, [row(sensor, stamp_ns) for stamp_ns in TIMES], sensor, tmp_path / 'tmp')
+        add_objects(store, TIMES, tmp_path / 'tmp')
         add(store, tmp_path / 'tmp', PATH, b'x,y', bucket='trajectories')
         path = catalog.row_of('trajectories', PATH, 3, 'text/csv', {'t_start_ns': str(NOON_NS)})
         add_part(store, [path], 'path', tmp_path / 'tmp')

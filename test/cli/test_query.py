@@ -125,8 +125,7 @@ def unicode_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(('encoding', 'cells'), [
-    ('ascii', rb'\u53bb\u53a8\u623f caf\xe9,\u5de1\u903b'), ('latin-1', b'\\u53bb\\u53a8\\u623f caf\xe9,\\u5de1\\u903b'),
-    ('utf-8', '去厨房 café,巡逻'.encode()),
+    ('latin-1', b'\\u53bb\\u53a8\\u623f caf\xe9,\\u5de1\\u903b'), ('utf-8', '去厨房 café,巡逻'.encode()),
 ])  # fmt: skip
 def test_csv_is_utf_8_whatever_the_locale(unicode_home: Path, encoding: str, cells: bytes) -> None:
     """Other encodings escape what they lack; an argument that the locale cannot decode is an error without a traceback."""

@@ -84,16 +84,13 @@ def test_episodes_added_later_give_the_same_bytes(house: House, tmp_path: Path, 
     assert [name for name in once if once[name] != then[name]] == ['meta/shadowhound_digests.json', 'meta/shadowhound_files.json']
 
 
-@pytest.mark.parametrize('mission', ['m0', 'm1', 'm2'])
-def test_a_dropped_episode_leaves_the_bytes_of_a_dataset_that_never_had_it(
-    house: House, tmp_path: Path, plain: Lerobot, mission: str
-) -> None:
+def test_a_dropped_episode_leaves_the_bytes_of_a_dataset_that_never_had_it(house: House, tmp_path: Path, plain: Lerobot) -> None:
     """Its frames are gone from the file, and the others are unchanged, with the bytes of a dataset that never had it."""
     exported(house, tmp_path / 'set')
-    drop(tmp_path / 'set', mission)
+    drop(tmp_path / 'set', 'm1')
     made = Lerobot(tmp_path / 'set')
     assert_same_frames(made, plain)
-    others = [each for each in ('m0', 'm1', 'm2') if each != mission]
+    others = ['m0', 'm2']
     without = exported(house, tmp_path / 'without', *others)
     assert made.mission_ids == without.mission_ids == others
     assert (tmp_path / 'set' / VIDEO).read_bytes() == (tmp_path / 'without' / VIDEO).read_bytes()

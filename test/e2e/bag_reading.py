@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from bags.slices import Recorded
 from e2e.witness import Heard
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -17,16 +18,6 @@ from rosbags.highlevel import AnyReader
 from shadowhound_data_logger.stores.base import ObjectStore
 
 BUCKET = 'sensor-data'
-
-
-class Recorded(NamedTuple):
-    """A message of a slice, in the order of the file."""
-
-    topic: str
-    log_ns: int
-    publish_ns: int
-    sequence: int
-    cdr: bytes
 
 
 @dataclass(slots=True)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from e2e.bag_reading import Bag, Recorded, bags, by_topic
+from bags.slices import Recorded
+from e2e.bag_reading import Bag, bags, by_topic
 from e2e.processes import LONG, WAIT_S, Node, Processes, is_accounted, published
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import Heard, recorded

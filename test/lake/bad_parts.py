@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import random
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Final
 
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.core.zstd import compress
+from shadowhound_data_logger.core.zstd import ZstdFile, compress
 from shadowhound_data_logger.formats.rows import catalog
 
 DATE: Final = '2026-10-28'
@@ -30,9 +32,15 @@ def lines(rows: Sequence[Mapping[str, Any]], kind: str = 'object', **changed: An
     return compress(''.join(f'{json.dumps(each)}\n' for each in told).encode(), 3)
 
 
+@cache
 def bomb() -> bytes:
-    """A gigabyte of one repeated line in some kilobytes."""
-    return compress(b'{"row":"object"' + b' ' * (1 << 30), 3)
+    """A gigabyte of one line in some kilobytes."""
+    target = io.BytesIO()
+    with ZstdFile(target, 'wb', level=3) as file:
+        file.write(b'{"row":"object"')
+        for _ in range(1024):
+            file.write(b' ' * (1 << 20))
+    return target.getvalue()
 
 
 def mutated(body: bytes, rng: random.Random) -> bytes:

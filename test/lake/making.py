@@ -89,6 +89,14 @@ def add(store: ObjectStore, folder: Path, key: str, body: bytes, metadata: dict[
                             metadata=metadata or {}, priority=5, created_ns=0))  # fmt: skip
 
 
+def add_objects(store: ObjectStore, times: Sequence[int], folder: Path) -> None:
+    """An object per sensor and time, and a part of the catalog per sensor."""
+    for sensor in SENSORS:
+        for stamp_ns in times:
+            add(store, folder, row(sensor, stamp_ns)['key'], content(sensor, stamp_ns))
+        add_part(store, [row(sensor, stamp_ns) for stamp_ns in times], sensor, folder)
+
+
 def fill(settings: StoreSettings, folder: Path, **which: Any) -> list[catalog.Row]:
     """Deliver the row files of some minutes, and the missions' summaries; returns the rows of the catalog."""
     every: list[catalog.Row] = []

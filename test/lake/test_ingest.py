@@ -227,7 +227,7 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import ingest
 from shadowhound_data_logger.lake.tables import Tables
-for _ in range(10):
+for _ in range(5):
     ingest(Bucket(StoreSettings(directory=Path(sys.argv[2])), 'sensor-data'), Tables(sys.argv[1]), Findings())
 """
 
@@ -237,13 +237,13 @@ def test_two_ingesters_and_a_compaction_at_a_time_add_every_row_once(tmp_path: P
     source = bucket(tmp_path)
     rows: list[catalog.Row] = []
     with closing(open_store(source.settings, UploadSettings())) as store:
-        for number in range(20):
+        for number in range(10):
             made = [row('camera', NOON_NS + (number * 10 + second) * SECOND) for second in range(5)]
             add_part(store, made, f'a{number}', tmp_path / 'tmp')
             rows += made
         command = [sys.executable, '-c', INGESTER, tables.root, str(source.settings.directory)]
         others = [subprocess.Popen(command) for _ in range(2)]
-        for number in range(20, 40):
+        for number in range(10, 20):
             made = [row('odom', NOON_NS + (number * 10 + second) * SECOND) for second in range(5)]
             add_part(store, made, f'b{number}', tmp_path / 'tmp')
             rows += made
@@ -253,7 +253,7 @@ def test_two_ingesters_and_a_compaction_at_a_time_add_every_row_once(tmp_path: P
     ingest(source, tables, Findings())
     assert Counter(table_keys(tables)) == Counter(keys(rows))
     with engine({'ingested': tables.open(INGESTED)}) as ready:
-        assert answer(ready, 'SELECT count(*) AS n, count(DISTINCT part) AS m FROM ingested').to_pylist() == [{'n': 40, 'm': 40}]
+        assert answer(ready, 'SELECT count(*) AS n, count(DISTINCT part) AS m FROM ingested').to_pylist() == [{'n': 20, 'm': 20}]
 
 
 def test_upkeep_makes_one_ordered_file_of_a_day_that_has_ended(tmp_path: Path, tables: Tables) -> None:

@@ -31,19 +31,35 @@ from shadowhound_data_logger.stores.base import ObjectStore
 pytestmark = pytest.mark.seaweedfs
 
 
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Tower]:
+@pytest.fixture(scope='module')
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tower]:
     """With a reader without write permission."""
-    with Tower(tmp_path / 'tower', users={'spark': ('Read', 'List')}) as started:
+    with Tower(tmp_path_factory.mktemp('tower'), users={'spark': ('Read', 'List')}) as started:
         yield started
 
 
-def with_bucket(server: Tower) -> None:
+@pytest.fixture
+def server(running: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Tower]:
+    """Without buckets, and with a new home for tables."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path / 'home'))
+    yield running
+    with closing(client_of(running)) as client:
+        for bucket in client.list_buckets()['Buckets']:
+            for page in client.get_paginator('list_objects_v2').paginate(Bucket=bucket['Name']):
+                if objects := [{'Key': each['Key']} for each in page.get('Contents', ())]:
+                    client.delete_objects(Bucket=bucket['Name'], Delete={'Objects': objects})
+            client.delete_bucket(Bucket=bucket['Name'])
+
+
+def client_of(server: Tower) -> Any:
     settings = server.store_settings()
-    client = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
-                          aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
-    client.create_bucket(Bucket='lake')
-    client.close()
+    return boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
+                        aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
+
+
+def with_bucket(server: Tower) -> None:
+    with closing(client_of(server)) as client:
+        client.create_bucket(Bucket='lake')
 
 
 def of(server: Tower, user: str) -> Bucket:

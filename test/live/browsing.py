@@ -6,14 +6,17 @@ import ast
 import asyncio
 import json
 import re
+import secrets
 import shutil
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from e2e.processes import until
+from domains import free_domain
+from e2e.processes import Processes, until
 
 import shadowhound_data_logger
 from shadowhound_data_logger.bags.recording import UNWRITABLE
@@ -32,6 +35,7 @@ from shadowhound_data_logger.spool.topic_account import PAUSED, WRONG_TYPE
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
+    from typing_extensions import Self
 
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
@@ -92,8 +96,19 @@ LONG = 'unbroken_' * 14
 NAMES = (HOSTILE, LONG)
 
 
+@contextmanager
+def in_own_domain(folder: Path) -> Iterator[Processes]:
+    """A robot's processes in a separate ROS domain; all are stopped at the end."""
+    with free_domain() as domain:
+        started = Processes(folder, domain, f'r{secrets.token_hex(4)}')
+        try:
+            yield started
+        finally:
+            started.end()
+
+
 class Served:
-    """A live page in this process, on a separate thread, until it is closed."""
+    """A live page in this process, on a separate thread; a context manager that closes it."""
 
     def __init__(self, settings: LiveSettings, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(server_module, 'find_spec', lambda _: None)  # no ROS here
@@ -115,6 +130,12 @@ class Served:
                 await asyncio.sleep(seconds)
 
         return asyncio.run_coroutine_threadsafe(show(), self.loop).cancel
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         self.run(self.server.close())

@@ -83,8 +83,7 @@ def test_the_table_of_robots_is_ordered_and_leads_to_each(browser: Browser, home
     """In order, with names as text; a click shows the past of that robot."""
     store_of(home, time.time_ns() - 10 * SECOND)
     settings = LiveSettings(spool=home / 'none', robot='thor', tokens=home / 'live', port=0, is_of_store=True)
-    served = Served(settings, monkeypatch)
-    try:
+    with Served(settings, monkeypatch) as served:
         page = opened(browser, served.server.url)
         holds(page, 'document.querySelectorAll("tr[data-robot]:not([data-state=unknown])").length === 4')
         rows = 'document.querySelectorAll("tr[data-robot]")'
@@ -97,8 +96,6 @@ def test_the_table_of_robots_is_ordered_and_leads_to_each(browser: Browser, home
         assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
         assert page.wrong == []  # type: ignore[attr-defined]
         page.close()
-    finally:
-        served.close()
 
 
 NAMES = ('\u202egnp.exe', '\x1b]0;title\x07\x00', 'mission ' * 1250, '\u05d0\u05d1 \u0627\u0628', f'"><{HOSTILE}', '${7*7}')
@@ -117,8 +114,7 @@ def test_hostile_names_of_missions_are_text(browser: Browser, home: Path, monkey
             add_part(store, [of_timeline], f'a{place}', home / 'tmp')
             add_part(store, [of_table], 'a', home / 'tmp')
     settings = LiveSettings(spool=home / 'none', robot='thor', tokens=home / 'live', port=0, is_of_store=True)
-    served = Served(settings, monkeypatch)
-    try:
+    with Served(settings, monkeypatch) as served:
         page = opened(browser, served.server.url)
         holds(page, f'document.querySelectorAll("[data-mark=mission]").length === {len(NAMES)}')
         holds(page, f'document.querySelectorAll("tr[data-state]:not([data-state=unknown])").length === {len(NAMES) + 1}')
@@ -133,5 +129,3 @@ def test_hostile_names_of_missions_are_text(browser: Browser, home: Path, monkey
         assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
         assert page.wrong == []  # type: ignore[attr-defined]
         page.close()
-    finally:
-        served.close()

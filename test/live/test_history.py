@@ -7,8 +7,6 @@ import json
 import os
 import shlex
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import simplejpeg
+from click.testing import CliRunner, Result
 from lake.gap_parts import lost, mark, tell
 from lake.making import NOON_NS, add, add_part, folder_store
 from lake.test_pull import Field
@@ -27,6 +26,7 @@ from live.test_kinds import cdr, header, new
 from spool.making import FakeClock, make, new_spool, put, settle
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, TriggerOf
+from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, UploadSettings
@@ -593,12 +593,16 @@ def test_late_and_waiting_objects_are_listed(store: ObjectStore, opened: Opened,
     assert waits[1] == noon + 39_000
 
 
-def ran(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a command line of the page, as in a shell."""
+def ran(command: str, folder: Path) -> Result:
+    """Run a command line of the page in a folder."""
     words = shlex.split(command)
     assert words[0] == 'shadowhound-data'
-    line = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *words[1:]]
-    return subprocess.run(line, cwd=folder, env=dict(os.environ), capture_output=True, text=True, check=False, timeout=240)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        result = CliRunner().invoke(cli, words[1:], standalone_mode=False)
+    if result.exception is not None:
+        raise result.exception
+    return result
 
 
 def test_the_commands_for_a_time_run(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
@@ -613,15 +617,13 @@ def test_the_commands_for_a_time_run(store: ObjectStore, opened: Opened, tmp_pat
     lines = dict(found['commands'])
     assert list(lines) == ['query', 'fetch', 'bag cut', 'export']
     (tmp_path / 'there').mkdir()
-    told = ran(f'{lines["query"]} --json', tmp_path / 'there')
-    assert len(json.loads(told.stdout)) >= 16, told.stderr
+    assert len(json.loads(ran(f'{lines["query"]} --json', tmp_path / 'there').stdout)) >= 16
     for what, made in (('fetch', 'data'), ('bag cut', 'cut')):
-        told = ran(lines[what], tmp_path / 'there')
-        assert told.returncode == 0, told.stderr
+        assert ran(lines[what], tmp_path / 'there').return_value == 0
         assert any(path.is_file() for path in (tmp_path / 'there' / made).rglob('*'))
-    told = ran(f'{lines["export"]} --dry-run', tmp_path / 'there')
-    assert told.returncode in {0, 1}
-    assert 'm1' in told.stdout + told.stderr
+    exported = ran(f'{lines["export"]} --dry-run', tmp_path / 'there')
+    assert exported.return_value in {0, 1}
+    assert 'm1' in exported.output
 
 
 def test_the_command_pulls_kept_data(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
@@ -631,9 +633,9 @@ def test_the_command_pulls_kept_data(store: ObjectStore, opened: Opened, tmp_pat
         history = opened(StorePast())
         noon = NOON_NS_OF_SPOOL // 1_000_000
         lines = dict(history.answer({'do': 'range', 'robot': 'thor', 'from': noon, 'to': noon + 2500})[0]['commands'])
-        told = ran(f'{lines["pull"]} --dry-run --json', tmp_path)
-        assert told.returncode == 0, told.stderr
-        assert '"objects": 3' in told.stdout, told.stdout
+        pulled = ran(f'{lines["pull"]} --dry-run --json', tmp_path)
+        assert pulled.return_value == 0
+        assert '"objects": 3' in pulled.stdout, pulled.stdout
         later = history.answer({'do': 'range', 'robot': 'thor', 'from': noon + 60_000, 'to': noon + 70_000})[0]
         assert 'pull' not in dict(later['commands'])
 

@@ -121,6 +121,15 @@ class Aliases:
         self._aliases[alias] = RegisteredVersion(name, version, source or source_of('go2', name, version), robots)
 
 
+def refused(robot: PolicySync) -> str:
+    """The reason why a sync is refused; the active version stays."""
+    before = robot.folder.current()
+    with pytest.raises(PolicyRefused) as raised:
+        robot.run()
+    assert robot.folder.current() == before
+    return raised.value.reason
+
+
 @dataclass
 class Scene:
     """A team, a store in a folder, a registry, and a robot that trusts the team."""
@@ -164,8 +173,4 @@ class Scene:
         self.spark.signing(self.store).publish({target_of('go2', 'go2_patrol', version): path.read_bytes()})
 
     def refused(self) -> str:
-        before = self.folder.current()
-        with pytest.raises(PolicyRefused) as raised:
-            self.robot.run()
-        assert self.folder.current() == before
-        return raised.value.reason
+        return refused(self.robot)

@@ -21,7 +21,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 import pytest
-from policies.models import Aliases, Spark, bucket_of, linear
+from policies.models import Aliases, Spark, bucket_of, linear, refused
 from shadowhound_tower.embedded import Tower
 from tuf.api.metadata import DelegatedRole, Delegations, Metadata, MetaFile, Root, Snapshot, TargetFile, Targets, Timestamp
 
@@ -113,12 +113,7 @@ class Battle:
     # -- the robot ---------------------------------------------------------------------------------------------------
 
     def refused(self) -> str:
-        """The reason why a sync is refused; the active version stays."""
-        before = self.folder.current()
-        with pytest.raises(PolicyRefused) as raised:
-            self.robot.run()
-        assert self.folder.current() == before
-        return raised.value.reason
+        return refused(self.robot)
 
     def taken(self) -> str | None:
         """The active version after a sync."""
@@ -252,7 +247,7 @@ def test_endless_files_are_read_to_their_maximum_size_only(battle: Battle, role:
     """No role's file is read beyond its limit; the next refresh repairs the store."""
     battle.publish(2)
     name = {'timestamp': 'timestamp.json', 'root': '2.root.json'}.get(role) or f'{battle.newest(role)}.{role}.json'
-    battle.write(name, bytes(100 << 20))
+    battle.write(name, bytes(40 << 20))
     tracemalloc.start()
     try:
         assert battle.refused() == 'untrusted'

@@ -50,7 +50,7 @@ def scene(tmp_path: Path) -> Scene:
     scene = Scene(tmp_path)
     for version in (1, 2):
         scene.publish(version)
-        scene.registry.say('champion', version)
+        scene.registry.set_alias('champion', version)
         scene.robot.run()
     return scene
 

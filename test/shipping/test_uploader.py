@@ -662,7 +662,8 @@ def test_a_drain_lock_that_cannot_be_opened_is_tried_again(spool: FakeSpool, sta
     assert (keeper.name, keeper.failures, keeper.last_error) == ('upload-lock', 2, 'SystemExit: 1')
 
 
-DAYS = 10
+DAYS = 3
+"""``torture.faults`` runs thousands."""
 
 
 def check_days(summary: Summary, first: int, days: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import secrets
 import shlex
 import signal
 import subprocess
@@ -16,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from domains import free_domain
 from e2e.processes import Node, Processes, until
-from live.browsing import CHROMIUM, counted, fits, holds, most_of, opened, press, rgb
+from live.browsing import CHROMIUM, counted, fits, holds, in_own_domain, most_of, opened, press, rgb
 from live.page.test_past import played
 from live.test_kinds import cdr, header, new
 from ros.ports import locked
@@ -66,12 +64,8 @@ class Watching:
 @pytest.fixture(scope='module')
 def watching(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watching]:
     pytest.importorskip('rclpy')
-    with free_domain() as domain:
-        processes = Processes(tmp_path_factory.mktemp('live'), domain, f'r{secrets.token_hex(4)}')
-        try:
-            yield Watching(processes)
-        finally:
-            processes.end()
+    with in_own_domain(tmp_path_factory.mktemp('live')) as started:
+        yield Watching(started)
 
 
 @pytest.fixture(scope='module')

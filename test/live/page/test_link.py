@@ -37,10 +37,9 @@ def test_the_page_survives_an_outage_of_the_store(browser: Browser, tmp_path: Pa
             monkeypatch.setenv(name, value)
         with closing(open_store(tower.store_settings(), UploadSettings())) as store:
             patrol(store, tmp_path)
-        served = Served(
+        with Served(
             LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True), monkeypatch
-        )
-        try:
+        ) as served:
             page = opened(browser, served.server.url)
             holds(page, 'document.querySelectorAll("rect.recorded").length > 1 && shadowhound.past?.shown.length > 1')
             page.evaluate('window.same = true')
@@ -58,8 +57,6 @@ def test_the_page_survives_an_outage_of_the_store(browser: Browser, tmp_path: Pa
             holds(page, 'document.querySelectorAll(".timeline [role=alert]").length === 0')
             assert page.evaluate('window.same')
             page.close()
-        finally:
-            served.close()
 
 
 @pytest.mark.ros
@@ -124,8 +121,7 @@ def test_the_page_reconnects_after_an_outage(browser: Browser, tmp_path: Path, m
 def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An open page reports it and stops connecting; with the new token it continues, without a reload."""
     settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind='0.0.0.0', port=0)
-    served = Served(settings, monkeypatch)
-    try:
+    with Served(settings, monkeypatch) as served:
         page = opened(browser, f'http://127.0.0.1:{served.server.port}/')
         tried: list[str] = []
         page.on('websocket', lambda socket: tried.append(socket.url))
@@ -148,8 +144,6 @@ def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path:
         assert page.evaluate('window.same')
         assert len(tried) > before
         page.close()
-    finally:
-        served.close()
 
 
 @pytest.mark.ros
@@ -159,8 +153,7 @@ def test_a_viewer_becomes_an_operator(browser: Browser, tmp_path: Path, monkeypa
     """The previous sign-in ends along with its connection; the page continues with the new one, without a reload."""
     monkeypatch.setattr(server_module, 'CHECK_S', 0.2)
     settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind='0.0.0.0', port=0)
-    served = Served(settings, monkeypatch)
-    try:
+    with Served(settings, monkeypatch) as served:
         page = opened(browser, f'http://127.0.0.1:{served.server.port}/')
         page.locator('input[name=token]').fill((tmp_path / 'live' / 'viewer.token').read_text().strip())
         press(page.locator('button.primary'))
@@ -177,8 +170,6 @@ def test_a_viewer_becomes_an_operator(browser: Browser, tmp_path: Path, monkeypa
         holds(page, f'shadowhound.count.figures > {count}')
         assert page.evaluate('window.same')
         page.close()
-    finally:
-        served.close()
 
 
 @pytest.mark.ros
@@ -188,8 +179,7 @@ def test_where_everybody_may_watch_an_operator_becomes_a_viewer(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Once the sign-in has ended, the page has no operator buttons any more, and continues."""
-    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
-    try:
+    with Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch) as served:
         page = opened(browser, served.server.url)
         press(page.get_by_role('button', name='Sign in', exact=True))
         page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
@@ -202,5 +192,3 @@ def test_where_everybody_may_watch_an_operator_becomes_a_viewer(
         count = counted(page, 'figures')
         holds(page, f'shadowhound.count.figures > {count}')
         page.close()
-    finally:
-        served.close()

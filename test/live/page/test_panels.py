@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import secrets
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -14,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from domains import free_domain
 from e2e.processes import Process, Processes, until
 from lake.making import folder_store
-from live.browsing import CHROMIUM, Served, fits, holds, opened, press
+from live.browsing import CHROMIUM, Served, fits, holds, in_own_domain, opened, press
 from live.page.any_robot import DESCRIPTION, HOSTILE, LATITUDE, LONGITUDE
 from live.test_history import patrol
 from live.test_kinds import cdr
@@ -58,12 +56,8 @@ class Watching:
 @pytest.fixture(scope='module')
 def watching(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watching]:
     pytest.importorskip('rclpy')
-    with free_domain() as domain:
-        processes = Processes(tmp_path_factory.mktemp('any'), domain, f'r{secrets.token_hex(4)}')
-        try:
-            yield Watching(processes)
-        finally:
-            processes.end()
+    with in_own_domain(tmp_path_factory.mktemp('any')) as started:
+        yield Watching(started)
 
 
 @pytest.fixture(scope='module')
@@ -305,8 +299,7 @@ def test_a_link_leads_to_a_moment(browser: Browser, tmp_path: Path, monkeypatch:
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
         patrol(store, tmp_path)
     store_page = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
-    served = Served(store_page, monkeypatch)
-    try:
+    with Served(store_page, monkeypatch) as served:
         page = opened(browser, served.server.url)
         holds(page, '(shadowhound.past?.count ?? 0) > 0')
         press(page.get_by_role('button', name='1 second back'))
@@ -317,35 +310,28 @@ def test_a_link_leads_to_a_moment(browser: Browser, tmp_path: Path, monkeypatch:
         holds(second, '(shadowhound.past?.count ?? 0) > 0')
         second.close()
         page.close()
-    finally:
-        served.close()
 
 
 def test_the_page_of_a_store_becomes_a_robots_when_a_node_starts(browser: Browser, tmp_path: Path) -> None:
     """It shows what it waits for, and changes in the browser automatically."""
     pytest.importorskip('rclpy')
-    with free_domain() as domain:
-        processes = Processes(tmp_path, domain, f'r{secrets.token_hex(4)}')
-        try:
-            (tmp_path / 'home' / 'store').mkdir(parents=True)
-            _, url = processes.page(SimpleNamespace(home=tmp_path / 'home', robot=processes.robot))  # type: ignore[arg-type]
-            page = opened(browser, url)
-            until(lambda: 'No node has run on this machine yet' in text(page, '[data-waits]'), 'what it waits for')
-            assert text(page, '.pill') == 'the store'
-            processes.node()
-            until(lambda: page.locator('.pill').inner_text() == 'recording', 'it is the page of the robot')
-            assert page.locator('[data-waits]').count() == 0
-            page.close()
-        finally:
-            processes.end()
+    with in_own_domain(tmp_path) as processes:
+        (tmp_path / 'home' / 'store').mkdir(parents=True)
+        _, url = processes.page(SimpleNamespace(home=tmp_path / 'home', robot=processes.robot))  # type: ignore[arg-type]
+        page = opened(browser, url)
+        until(lambda: 'No node has run on this machine yet' in text(page, '[data-waits]'), 'what it waits for')
+        assert text(page, '.pill') == 'the store'
+        processes.node()
+        until(lambda: page.locator('.pill').inner_text() == 'recording', 'it is the page of the robot')
+        assert page.locator('[data-waits]').count() == 0
+        page.close()
 
 
 def test_three_dimensions_are_loaded_when_they_are_in_view(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two thirds of the page's bytes; on a phone the camera and the save button come first, and one finger scrolls."""
-    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='turtle', tokens=tmp_path / 'live', port=0), monkeypatch)
-    try:
+    with Served(LiveSettings(spool=tmp_path / 'spool', robot='turtle', tokens=tmp_path / 'live', port=0), monkeypatch) as served:
         phone = browser.new_context(viewport={'width': 390, 'height': 420}, has_touch=True, is_mobile=True)
         page = phone.new_page()
         page.goto(served.server.url)
@@ -361,8 +347,6 @@ def test_three_dimensions_are_loaded_when_they_are_in_view(
         assert manifest.headers['content-type'].startswith('application/manifest+json')
         assert manifest.json()['display'] == 'standalone'
         phone.close()
-    finally:
-        served.close()
 
 
 @pytest.mark.parametrize('tiles', ['', 'https://tile.example/{z}/{x}/{y}.png'])

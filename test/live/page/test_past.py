@@ -143,8 +143,7 @@ def test_the_page_of_a_store_shows_the_past_without_a_robot(
             add(store, tmp_path / 'tmp', row['key'], jpeg(9))
         add_part(store, rows, 'names', tmp_path / 'tmp')
     store_page = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
-    served = Served(store_page, monkeypatch)
-    try:
+    with Served(store_page, monkeypatch) as served:
         page = opened(browser, served.server.url)
         holds(page, "document.querySelectorAll('rect.recorded').length > 2 && shadowhound.past?.shown.length > 2")
         press(page.get_by_role('button', name='Sign in', exact=True))
@@ -169,5 +168,3 @@ def test_the_page_of_a_store_shows_the_past_without_a_robot(
         assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
         assert page.wrong == []
         page.close()
-    finally:
-        served.close()

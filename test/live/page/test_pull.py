@@ -30,8 +30,7 @@ def test_an_operator_requests_kept_data(browser: Browser, tmp_path: Path, monkey
     with closing(Field(tmp_path)) as field:
         field.records(*range(20))
         settings = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
-        served = Served(settings, monkeypatch)
-        try:
+        with Served(settings, monkeypatch) as served:
             page = opened(browser, served.server.url)
             ask, said = page.locator('[data-act=pull]'), page.locator('.pull')
             holds(page, "document.querySelectorAll('rect.kept').length === 1 && document.querySelector('[data-offer]')")
@@ -56,5 +55,3 @@ def test_an_operator_requests_kept_data(browser: Browser, tmp_path: Path, monkey
                 fits(page, width)
             assert page.wrong == []
             page.close()
-        finally:
-            served.close()

@@ -58,15 +58,12 @@ def page(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     tell(settings, tmp_path, lost('1', 3, 4, cause='transport', topic='/imu'), mark(8, topic='/imu'),
          lost('2', 6, 7, cause=HOSTILE, topic='/odom', count=2))  # fmt: skip
     store_page = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
-    served = Served(store_page, monkeypatch)
-    try:
+    with Served(store_page, monkeypatch) as served:
         page = opened(browser, served.server.url)
         holds(page, 'shadowhound.past?.count > 0 && document.querySelectorAll("rect.gap").length === 2')
         yield page
         assert page.wrong == []  # type: ignore[attr-defined]
         page.close()
-    finally:
-        served.close()
 
 
 def shown(page: Page) -> tuple[int, int, int]:
@@ -227,8 +224,7 @@ def test_losses_are_shown_until_acknowledged(browser: Browser, tmp_path: Path, m
            'rate_hz': 50.0, 'age_s': 0.01, 'publishers': 1, 'may_be_silent': False, 'received': 99, 'stored': 99}  # fmt: skip
     figures = {'robot': 'thor', 'state': 'running', 'age_s': 0.1, 'paused': False, 'queue': {}, 'findings': [], 'balanced': True,
                'spool': {}, 'store': {}, 'objects': {}, 'bytes': {}, 'topics': [row]}  # fmt: skip
-    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
-    try:
+    with Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch) as served:
         monkeypatch.setattr(served.server._figures, 'now', lambda **_: figures)
         monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: told)
         page = opened(browser, served.server.url)
@@ -243,8 +239,6 @@ def test_losses_are_shown_until_acknowledged(browser: Browser, tmp_path: Path, m
         holds(page, 'document.querySelector("[data-losses]")?.dataset.losses === "0"')
         assert page.wrong == []  # type: ignore[attr-defined]
         page.close()
-    finally:
-        served.close()
 
 
 @in_chromium
@@ -272,8 +266,7 @@ def test_the_live_view_begins_with_what_was_recorded(browser: Browser, tmp_path:
                             t_start_ns=at_ns, t_end_ns=at_ns, metadata=metadata))  # fmt: skip
     finally:
         spool.close()
-    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
-    try:
+    with Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch) as served:
         served.loop.call_soon_threadsafe(served.server.viewers.on_graph, {'/imu': (IMU, 1)})
         page = opened(browser, served.server.url)
         holds(page, 'window.shadowhound?.prefilled >= 2')
@@ -281,8 +274,6 @@ def test_the_live_view_begins_with_what_was_recorded(browser: Browser, tmp_path:
         holds(page, f'{shown} === "9.5"')
         assert page.wrong == []  # type: ignore[attr-defined]
         page.close()
-    finally:
-        served.close()
 
 
 BLINDNESS = {
@@ -319,8 +310,7 @@ def test_each_cause_of_a_gap_has_its_own_color(browser: Browser, tmp_path: Path,
         const [hue, mark] = document.getElementById(pattern).children;
         return [getComputedStyle(hue).fill, mark.getAttribute('d'), getComputedStyle(mark).fill];
     })"""
-    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
-    try:
+    with Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch) as served:
         monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: gaps)
         page = opened(browser, served.server.url)
         holds(page, f'document.querySelectorAll("rect.gap").length === {len(causes)}')
@@ -339,8 +329,6 @@ def test_each_cause_of_a_gap_has_its_own_color(browser: Browser, tmp_path: Path,
                 assert min(apart.values()) > APART, (scheme, kind, min(apart, key=lambda pair: apart[pair]), min(apart.values()))
         assert page.wrong == []
         page.close()
-    finally:
-        served.close()
 
 
 APART = 20.0

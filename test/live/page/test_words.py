@@ -80,14 +80,11 @@ def test_every_figure_of_the_past_has_a_definition(browser: Browser, tmp_path: P
         field.records(*range(20))
         store_of(tmp_path, time.time_ns() - 10 * SECOND)
         settings = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
-        served = Served(settings, monkeypatch)
-        try:
+        with Served(settings, monkeypatch) as served:
             page = opened(browser, served.server.url)
             holds(page, 'document.querySelectorAll("tr[data-robot]:not([data-state=unknown])").length === 4')
             assert undefined(page) == []
             page.close()
-        finally:
-            served.close()
 
 
 def touch(session: CDPSession, kind: str, *points: tuple[float, float]) -> None:
@@ -170,8 +167,7 @@ def test_an_unfinished_check_is_not_an_error(browser: Browser, robot: Served, mo
 def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names, reasons and responses with code or without spaces: none of it runs, and it fits on a phone."""
     settings = LiveSettings(spool=tmp_path / 'spool', robot=LONG[:60], tokens=tmp_path / 'live', port=0)
-    served = Served(settings, monkeypatch)
-    try:
+    with Served(settings, monkeypatch) as served:
         figures, gaps = told_of_names(time.time() * 1e3)
         monkeypatch.setattr(served.server._figures, 'now', lambda **_: figures)
         monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: gaps)
@@ -193,8 +189,6 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
         assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
         assert page.wrong == []
         page.close()
-    finally:
-        served.close()
 
 
 @pytest.mark.ros
