@@ -220,7 +220,7 @@ def test_the_cost_of_many_topics_is_bounded(page: Page, watching: Watching) -> N
 def test_topics_that_are_not_logged_have_figures(page: Page, watching: Watching) -> None:
     """Rate, size and age, and when they were sampled, without a click, while the table is in view.
 
-    At most two of the 510 topics that nobody else takes are subscribed to at a time, and none once the table is out of view.
+    At most two of the 510 topics without another subscriber are subscribed to at a time, and none once the table is out of view.
     """
     with observer(watching) as read:
 
