@@ -105,7 +105,7 @@ def test_what_a_hostile_node_announces_is_bounded(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.ros
 @pytest.mark.parametrize('name', ['no such', '1', 'x' * 300, 'absent'])
 def test_a_node_that_cannot_be_asked_is_asked_once(name: str, domain: int) -> None:
-    """A name is invalid, as of a participant that is not a ROS node, or nobody has it; afterwards nothing is expected."""
+    """A name is invalid, as of a participant that is not a ROS node, or no node has it; afterwards no answer is awaited."""
     pytest.importorskip('type_description_interfaces')
     logger = Participant('asking', domain)
     info = SimpleNamespace(topic_type=NAME, topic_type_hash='RIHS01_0', node_namespace='/', node_name=name)
