@@ -194,7 +194,7 @@ def bag_info(*, bag: str | Path, robot: str | None, as_json: bool) -> ExitCode:
 
 def _rows(rows: Sequence[BagRow]) -> RenderableType:
     columns = ('bag', 'state', 'began (UTC)', 'duration', 'messages', 'topics', 'slices', 'size', 'where')
-    table = plain_table('Bags', columns, ('bag', 'state', 'began (UTC)', 'where'))
+    table = plain_table('Bags', columns, ('bag', 'state', 'began (UTC)', 'where'), minor=('slices', 'topics', 'duration'))
     for row in rows:
         length = '-' if row.t_start_ns is None or row.t_end_ns is None else duration((row.t_end_ns - row.t_start_ns) / 1e9)
         table.add_row(

@@ -201,7 +201,7 @@ def _covered(found: Sequence[Coverage], by: str) -> Iterator[RenderableType]:
     if not found:
         yield plain('Nothing is known yet: no robot has uploaded its gap journal. A node does so each minute while it delivers.')
         return
-    table = plain_table('', ('robot', 'topic', 'hour (UTC)', 'stored', 'downsampled', 'gaps', 'not known yet', 'why'),
+    table = plain_table('', ('robot', 'topic', 'hour (UTC)', 'stored', 'downsampled', 'gaps', 'unknown', 'why'),
                         ('robot', 'topic', 'hour (UTC)', 'why'))  # fmt: skip
     table.title = None
     for each in found:

@@ -192,7 +192,9 @@ def _wait(where: Path, end_s: float) -> list[MissionBrief]:
 
 def _table(found: Sequence[MissionBrief]) -> RenderableType:
     left = ('mission', 'type', 'started', 'result', 'run')
-    table = plain_table('Missions', ('mission', 'type', 'started', 'duration', 'result', 'unsent', 'run'), left)
+    table = plain_table(
+        'Missions', ('mission', 'type', 'started', 'duration', 'result', 'unsent', 'run'), left, minor=('run', 'type', 'duration')
+    )
     for each in found:
         table.add_row(plain(each.mission_id), plain(each.type), shown_iso(each.started), duration(each.duration_s),
                       _result(each), _unsent(each), plain(each.run_id or '-'))  # fmt: skip

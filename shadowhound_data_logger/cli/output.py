@@ -64,9 +64,17 @@ def plain(text: object, style: str = '') -> Text:
     return Text(printable(str(text)), style)
 
 
-def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topic', '')) -> Table:
-    """Without lines, numbers to the right, nothing cut: a topic is broken across lines before it loses a letter."""
-    table = Table(title=title, title_justify='left', title_style='bold', header_style='dim', box=None, pad_edge=False)
+class _Table(Table):
+    minor: Sequence[str] = ()
+
+
+def plain_table(title: str, columns: Iterable[str], left: Iterable[str] = ('topic', ''), minor: Sequence[str] = ()) -> Table:
+    """Without lines, numbers to the right, nothing cut: a topic is broken across lines before it loses a letter.
+
+    On a narrow terminal, columns in ``minor`` are omitted, the first one first.
+    """
+    table = _Table(title=title, title_justify='left', title_style='bold', header_style='dim', box=None, pad_edge=False)
+    table.minor = minor
     for name in columns:
         is_left = name in left
         table.add_column(plain(name), justify='left' if is_left else 'right', overflow='fold', no_wrap=not is_left)
@@ -86,8 +94,8 @@ def value_table(title: str, values: Mapping[str, object]) -> Table:
 def fitted(parts: Sequence[RenderableType], console: Console) -> list[RenderableType]:
     """The parts, with tables in which no word is broken.
 
-    Columns are two apart, or one where that is too wide. Cells of several words are folded between them; a table that is still
-    too wide becomes a list of names and values for each row, as in psql's expanded display.
+    Columns are two apart, or one where that is too wide. Then minor columns are omitted, or cells of several words are folded
+    between them; a table that is still too wide becomes a list of names and values for each row, as in psql's expanded display.
     """
     wide = {id(each): _fitted(each, console) for each in _tables(parts)}
     return [wide.get(id(part), part) for part in parts]
@@ -106,6 +114,13 @@ def _fitted(table: Table, console: Console) -> Table:
     table.padding = (0, 1, 0, 0)
     if _width(table, console) <= console.width:
         return table
+    minor = table.minor if isinstance(table, _Table) else ()
+    for count in range(1, len(minor) + 1):
+        less = _without(table, minor[:count])
+        if _width(less, console) <= console.width:
+            less.caption = plain(f'Not shown: {", ".join(minor[:count])} (--json has all columns)', 'dim')
+            less.caption_justify = 'left'
+            return less
     sizes = [_size(column, console) for column in table.columns]
     spare = console.width - sum(size.minimum for size in sizes) - len(sizes) + 1
     if spare < 0:
@@ -117,6 +132,17 @@ def _fitted(table: Table, console: Console) -> Table:
     for column, width in zip(table.columns, widths, strict=True):
         column.width = width
     return table
+
+
+def _without(table: Table, names: Sequence[str]) -> Table:
+    kept = [column for column in table.columns if str(column.header) not in names]
+    found = plain_table(
+        '', (str(column.header) for column in kept), [str(each.header) for each in kept if each.justify == 'left']
+    )
+    found.title, found.padding = table.title, table.padding
+    for cells in zip(*(list(column.cells) for column in kept), strict=True):
+        found.add_row(*cells)
+    return found
 
 
 def _size(column: Column, console: Console) -> Measurement:

@@ -129,7 +129,7 @@ def list_(*, as_json: bool) -> ExitCode:
         for row in rows:
             marks = [word for word in ('active', 'pinned') if row[word]]
             table.add_row(str(row['policy']), ' '.join(marks), str(row['isolation'] or '-'), str(row['why_not']))
-        print_page(table)
+        print_page(table) if rows else click.echo('There is no version on this robot.')
         if stale:
             click.echo(f'no new version is taken: {stale}')
     return ExitCode.FINE

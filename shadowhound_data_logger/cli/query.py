@@ -44,6 +44,8 @@ SHOWN: Final = 30
 """Rows of a table unless --limit says more."""
 COLUMNS: Final = ('likeness', 't_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type', 'labels')
 """Of a table of objects; the other formats have all."""
+MINOR: Final = ('mission_type', 'battery_pct', 'sensor', 'y', 'x')
+"""Of these, what a narrow terminal does not show."""
 MAX_POSES: Final = 20_000
 MAX_TIMES: Final = 100
 _OBJECTS: Final = {'bucket', 'key'}
@@ -115,7 +117,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
 
         if when is not None:
             if sql or sheet or ground or order or limit or with_labels or kind not in {'table', 'json'}:
-                raise BadUsage('--when answers with times, as a table or JSON',
+                raise BadUsage('--when answers with times, without SQL, --order, --limit, --labels, --sheet, --map',
                                'write them to a file with --json, and query again with --ranges FILE')  # fmt: skip
             return _times(when, flags, scan=scan, join_s=join_s, pad_s=pad_s, is_json=as_json or kind == 'json')
         if scan or join_s is not None or pad_s:
@@ -243,7 +245,8 @@ def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool, by: st
     if is_objects:
         columns = [name for name in columns if any(row[name] is not None for row in rows)]
     left = {name for name in columns if any(isinstance(row[name], (str, datetime)) for row in rows)}
-    table = plain_table('', columns, left)
+    minor = [name for name in MINOR if name in columns] if is_objects else []
+    table = plain_table('', columns, left, minor)
     table.title = None
     for row in rows:
         table.add_row(*(plain(_cell(name, row[name])) for name in columns))
@@ -259,7 +262,7 @@ def _verdict(found: Any, shown: int, where: str, *, is_objects: bool) -> str:
     what = 'objects' if is_objects else 'rows'
     if not len(found):
         return f'No {what} in {where} match the query.{store_hint()}'
-    text = f'{number(len(found))} {what}'
+    text = counted(len(found), what[:-1])
     if is_objects:
         text += f', {volume(sum(found["bytes"].to_pylist()))}'
     return f'{text}; the first {shown} are shown (--limit, or another --format)' if shown < len(found) else text

@@ -185,3 +185,21 @@ def test_json_is_ascii(home: Path) -> None:
     """It parses to the same text."""
     rows = json.loads(run(home, '--json').output)
     assert rows[0]['key'] == EVIL['key']
+
+
+def test_minor_columns_are_omitted_before_rows_are_expanded() -> None:
+    """As many as needed, the first one first, and the caption names them; if that is not enough, every value is shown."""
+
+    def shown(width: int) -> str:
+        table = plain_table('', ('key', 'bytes', 'x', 'mission'), ('key', 'mission'), minor=('mission', 'x'))
+        table.add_row('thor/camera/1.jpg', '40,215', '0.12', 'patrol')
+        output = io.StringIO()
+        console = Console(file=output, width=width, force_terminal=True, color_system=None)
+        print_page(table, console=console)
+        return output.getvalue()
+
+    assert 'patrol' in shown(40)
+    assert 'Not shown' not in shown(40)
+    assert ('patrol' in shown(32), '0.12' in shown(32), 'Not shown: mission' in shown(32)) == (False, True, True)
+    assert ('0.12' in shown(26), 'mission, x' in ' '.join(shown(26).split())) == (False, True)
+    assert ('patrol' in shown(20), 'Not shown' in shown(20)) == (True, False)
