@@ -385,7 +385,7 @@ def test_why_a_topic_cannot_be_sampled_is_reported(tmp_path: Path, monkeypatch: 
 
 
 def test_a_message_of_an_unknown_type_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its publisher is asked for the definition."""
+    """Its publisher provides the definition."""
 
     async def doing(found: Robot) -> None:
         with publisher(int(os.environ['ROS_DOMAIN_ID'])):
