@@ -61,6 +61,7 @@ def test_a_definition_is_as_in_the_package(name: str) -> None:
     lambda one: one.referenced_type_descriptions.extend(one.referenced_type_descriptions * 99),
     lambda one: one.referenced_type_descriptions.append(one.type_description),
     lambda one: one.type_description.fields.clear(),
+    lambda one: [setattr(one.type_description.fields[0].type, *each) for each in (('type_id', 49), ('capacity', 513))],
     lambda one: setattr(one.type_description.fields[1].type, 'type_id', 51),
 ])  # fmt: skip
 def test_another_definition_is_refused(change: Callable[[Any], object]) -> None:
