@@ -21,8 +21,8 @@ for folder in ('formats.mcap', 'bags'):
     package = importlib.import_module(f'shadowhound_data_logger.{folder}')
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f'{package.__name__}.{module.name}')
-from shadowhound_data_logger.core.untrusted import unpacked
-print(unpacked('zstd', zstd.compress(b'a chunk')))
+from shadowhound_data_logger.core.untrusted import decompress
+print(decompress('zstd', zstd.compress(b'a chunk')))
 """
 
 

@@ -14,6 +14,7 @@ from e2e.reading import Objects
 from e2e.session import Session
 from e2e.station import Station
 from live.conftest import browser  # noqa: F401 - a fixture
+from missions.conftest import server, warm_home  # noqa: F401 - fixtures of test_guide.py and test_closed_loop.py
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.config import UploadSettings
