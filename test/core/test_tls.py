@@ -29,7 +29,7 @@ import aiohttp
 import click
 import pytest
 from click.testing import CliRunner, Result
-from doctor.scene import Scene, expect, scenes
+from doctor.scene import Scene, assert_finding, scenes
 from lake.training import Drive
 from live.test_relay import GRAPH, Browser, publish, until
 from live.test_relay import tower as relaying
@@ -385,7 +385,7 @@ def test_the_doctor_names_a_wrong_certificate(
     with served(FakeS3()) as server, behind_tls(server.url, authorities[signer].sign(kind, **how)) as front:
         scene.environ |= {client.bundle: str(authorities['authority'].path), client.address: front.url}
         results = scene.ask(f'network.{name}', name)
-    expect([result for result in results if result.is_finding], f'network.{name}.tls.{kind}', *FINDINGS[kind])
+    assert_finding([result for result in results if result.is_finding], f'network.{name}.tls.{kind}', *FINDINGS[kind])
     assert results[-1].severity is Severity.SKIPPED
     assert front.inside.heard == b''
 
@@ -408,14 +408,14 @@ def test_the_doctor_proposes_plain_http_where_the_port_has_no_tls(scene: Scene) 
     """With the working URL."""
     with served(FakeS3()) as server:
         scene.environ['AWS_ENDPOINT_URL'] = server.url.replace('http:', 'https:')
-        expect(scene.findings('network.s3'), 'network.s3.tls', f'export AWS_ENDPOINT_URL={server.url}')
+        assert_finding(scene.findings('network.s3'), 'network.s3.tls', f'export AWS_ENDPOINT_URL={server.url}')
 
 
 def test_the_doctor_names_a_bundle_that_is_missing(scene: Scene, authorities: dict[str, Authority]) -> None:
     """The server is not reported."""
     with served(FakeS3()) as server, behind_tls(server.url, authorities['authority'].sign('good')) as front:
         scene.environ |= {'AWS_ENDPOINT_URL': front.url, 'AWS_CA_BUNDLE': '/nowhere/ca.pem'}
-        expect(scene.findings('network.s3'), 'network.s3.tls', 'ls -l /nowhere/ca.pem')
+        assert_finding(scene.findings('network.s3'), 'network.s3.tls', 'ls -l /nowhere/ca.pem')
 
 
 # -- the live page -----------------------------------------------------------------------------------------------------

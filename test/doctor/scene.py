@@ -119,7 +119,7 @@ class Scene:
         (self.root / 'proc/net/tcp').write_text('\n'.join(lines) + '\n')
 
 
-def expect(found: list[Result], name: str, *words: str) -> None:
+def assert_finding(found: list[Result], name: str, *words: str) -> None:
     """The only finding, by its name, with a remedy that contains this text."""
     told = [f'{result.check}: {result.seen} | {result.cause} -> {result.remedy}' for result in found]
     assert [result.check for result in found] == [name], told or 'nothing was found'

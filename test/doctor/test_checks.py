@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from doctor.scene import Scene, expect
+from doctor.scene import Scene, assert_finding
 from spool.making import make, put, settle
 
 from shadowhound_data_logger.core.clock import SECOND
@@ -306,7 +306,7 @@ def test_a_fault_is_found_and_named(robot: Scene, inject: Inject, asked: str, na
     found = robot.findings(asked)
     if name == 'tower.listen':
         found = found[:1]  # both addresses use the same port here
-    expect(found, name, *words)
+    assert_finding(found, name, *words)
 
 
 def test_shared_memory_of_killed_processes_is_freed(robot: Scene) -> None:
@@ -350,7 +350,7 @@ def test_a_parameter_file_for_another_node_is_a_finding(robot: Scene, tmp_path: 
     path = tmp_path / 'mine.yaml'
     path.write_text('sensor_loger_node:\n  ros__parameters: {camera: {rate_hz: 2.0}}\n')
     context = make_context(robot.environ, role=robot.role, parameter_file=path, root=robot.root)
-    expect([each for each in environment.check(context) if each.is_finding], 'environment.parameters', '/**:')
+    assert_finding([each for each in environment.check(context) if each.is_finding], 'environment.parameters', '/**:')
 
 
 def test_every_check_is_on_the_page() -> None:
@@ -430,12 +430,12 @@ def test_a_full_disk_is_a_finding(scene: Scene, small_disk: Path) -> None:
     with (small_disk / 'filler').open('wb', buffering=0) as file:
         while os.statvfs(small_disk).f_bavail:
             file.write(bytes(4096))
-    expect(scene.findings('disk'), 'disk.space', f'df -h {small_disk}')
+    assert_finding(scene.findings('disk'), 'disk.space', f'df -h {small_disk}')
     scene.parameters['spool.min_free_bytes'] = 0
-    expect(scene.findings('disk'), 'disk.space', f'df -h {small_disk}')
+    assert_finding(scene.findings('disk'), 'disk.space', f'df -h {small_disk}')
 
 
 def test_a_read_only_spool_is_a_finding(scene: Scene, small_disk: Path) -> None:
     """With the command that makes it writable again."""
     subprocess.run(['mount', '-o', 'remount,ro', str(small_disk)], check=True)
-    expect(scene.findings('disk'), 'disk.readonly', f'remount,rw {small_disk}')
+    assert_finding(scene.findings('disk'), 'disk.readonly', f'remount,rw {small_disk}')

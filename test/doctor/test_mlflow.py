@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from doctor.scene import Scene, expect
+from doctor.scene import Scene, assert_finding
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.doctor import mlflow
@@ -70,7 +70,7 @@ def test_the_login_of_mlflows_own_file_is_used(with_tower: Scene, servers: Tower
     file.parent.mkdir()
     file.write_text(f'[mlflow]\nmlflow_tracking_username = {user}\n')
     file.chmod(0o600)
-    expect(with_tower.findings('environment'), 'environment.login', 'MLFLOW_TRACKING_PASSWORD')
+    assert_finding(with_tower.findings('environment'), 'environment.login', 'MLFLOW_TRACKING_PASSWORD')
     file.write_text(f'[mlflow]\nmlflow_tracking_username = {user}\nmlflow_tracking_password = {password}\n')
     assert with_tower.findings('environment', 'mlflow') == []
 
@@ -83,7 +83,7 @@ def test_artifacts_that_do_not_reach_their_store_are_a_finding(with_tower: Scene
         artifacts.rename(away)
     artifacts.write_text('a disk that is not mounted')
     try:
-        expect(with_tower.findings('mlflow'), 'mlflow.artifacts', 'docker logs', 'MLFLOW_S3')
+        assert_finding(with_tower.findings('mlflow'), 'mlflow.artifacts', 'docker logs', 'MLFLOW_S3')
     finally:
         artifacts.unlink()
         if away.exists():
@@ -99,20 +99,20 @@ def test_artifacts_that_stay_on_the_robot_are_a_finding(with_tower: Scene, serve
         with database:
             database.execute(move, (f'file://{tmp_path}', number))
         try:
-            expect(with_tower.findings('mlflow'), 'mlflow.artifacts', '--artifacts-destination s3://mlflow')
+            assert_finding(with_tower.findings('mlflow'), 'mlflow.artifacts', '--artifacts-destination s3://mlflow')
         finally:
             with database:
                 database.execute(move, (experiment['artifact_location'], number))
     rest(servers, 'experiments/delete', experiment_id=number)
     try:
-        expect(with_tower.findings('mlflow'), 'mlflow.missions', f'mlflow experiments restore -x {number}')
+        assert_finding(with_tower.findings('mlflow'), 'mlflow.missions', f'mlflow experiments restore -x {number}')
     finally:
         rest(servers, 'experiments/restore', experiment_id=number)
 
 
 def test_artifacts_that_are_sent_to_s3_directly_need_credentials(with_tower: Scene, servers: Tower) -> None:
     """Then the robot's keys and MLFLOW_S3_ENDPOINT_URL are used."""
-    expect(_direct(with_tower, 's3://mlflow/9'), 'mlflow.artifacts', 's3:PutObject', 'mlflow')
+    assert_finding(_direct(with_tower, 's3://mlflow/9'), 'mlflow.artifacts', 's3:PutObject', 'mlflow')
     with_tower.environ |= servers.environment('tower')
     assert [result.severity for result in _direct(with_tower, 's3://mlflow/9')] == [Severity.OK]
 

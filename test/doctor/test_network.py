@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 import pytest
-from doctor.scene import Inject, Scene, expect, hanging, keys, nobody_there
+from doctor.scene import Inject, Scene, assert_finding, hanging, keys, nobody_there
 from faults.front import Front
 from faults.kinds import Condition, Fault
 from shadowhound_tower.embedded import Tower
@@ -110,7 +110,7 @@ def test_a_fault_is_found_and_named(with_tower: Scene, inject: Inject, name: str
         found = [result for result in {result.check: result for result in found}.values()]  # noqa: C416 - one of each bucket
     if name == 's3.clock':
         found = found[-1:]  # by the Date header, and by the refusal
-    expect(found, name, *words)
+    assert_finding(found, name, *words)
 
 
 def test_swapped_ports_are_named(with_tower: Scene) -> None:
@@ -125,7 +125,7 @@ def test_the_usual_port_is_proposed(with_tower: Scene, monkeypatch: pytest.Monke
     """If nothing listens on the configured port, and a server on the usual one."""
     nobody_there('AWS_ENDPOINT_URL')(with_tower)
     monkeypatch.setattr(network, '_answers', lambda _, port: port == 9000)
-    expect(with_tower.findings('network.s3'), 'network.s3.tcp', 'export AWS_ENDPOINT_URL=http://127.0.0.1:9000')
+    assert_finding(with_tower.findings('network.s3'), 'network.s3.tcp', 'export AWS_ENDPOINT_URL=http://127.0.0.1:9000')
 
 
 def test_every_address_of_a_name_is_tried(with_tower: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +141,7 @@ def test_every_address_of_a_name_is_tried(with_tower: Scene, monkeypatch: pytest
     with_tower.environ['AWS_ENDPOINT_URL'] = with_tower.environ['AWS_ENDPOINT_URL'].replace('127.0.0.1', 'localhost')
     assert with_tower.findings('network.s3') == []
     with_tower.environ['AWS_ENDPOINT_URL'] = 'http://localhost:1'
-    expect(with_tower.findings('network.s3'), 'network.s3.tcp', 'ss -ltnp')
+    assert_finding(with_tower.findings('network.s3'), 'network.s3.tcp', 'ss -ltnp')
 
 
 def test_missing_parts_of_a_tower_are_named(with_tower: Scene, servers: Tower) -> None:
@@ -152,7 +152,7 @@ def test_missing_parts_of_a_tower_are_named(with_tower: Scene, servers: Tower) -
     admin.open()
     admin._client.delete_bucket(Bucket='lerobot')
     try:
-        expect(with_tower.findings('s3'), 's3.bucket', 's3 mb s3://lerobot')
+        assert_finding(with_tower.findings('s3'), 's3.bucket', 's3 mb s3://lerobot')
     finally:
         S3Requests(admin).create_bucket('lerobot')
         admin.close()

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from doctor.scene import Scene, expect
+from doctor.scene import Scene, assert_finding
 from domains import free_domain
 
 from shadowhound_data_logger.doctor.context import make
@@ -126,22 +126,22 @@ FAULTS = {
 def test_a_fault_is_found_and_named(examined: Examined, robot: str, name: str, words: tuple[str, ...]) -> None:
     """By exactly one finding, with the correct remedy; but a busy machine loses messages of each of them."""
     found = findings(examined.robots[robot])
-    expect([each for each in found if each.check == name or each.check != 'ros.loss'], name, *words)
+    assert_finding([each for each in found if each.check == name or each.check != 'ros.loss'], name, *words)
 
 
 def test_a_wrong_domain_is_named(examined: Examined) -> None:
     """If the topics are in another domain, that one is named."""
-    expect(findings(examined.elsewhere), 'ros.domain', f'export ROS_DOMAIN_ID={examined.domain}')
+    assert_finding(findings(examined.elsewhere), 'ros.domain', f'export ROS_DOMAIN_ID={examined.domain}')
 
 
 def test_a_missing_driver_is_named(examined: Examined) -> None:
     """If there are no participants anywhere, the guide's three questions are in the remedy."""
-    expect(findings(examined.nowhere), 'ros.topics', 'go2_driver', 'robot.launch.py', 'ROS_DOMAIN_ID')
+    assert_finding(findings(examined.nowhere), 'ros.topics', 'go2_driver', 'robot.launch.py', 'ROS_DOMAIN_ID')
 
 
 def test_a_robot_in_a_namespace_is_named(examined: Examined) -> None:
     """As a driver of several robots publishes: the existing topics are named, and how to log one robot's."""
-    expect(findings(examined.unnamed), 'ros.topics', '-r __ns:=/', 'one node for each of', '/well')
+    assert_finding(findings(examined.unnamed), 'ros.topics', '-r __ns:=/', 'one node for each of', '/well')
     assert '/deaf/imu' in findings(examined.unnamed)[0].seen
 
 
@@ -191,14 +191,14 @@ def test_other_robots_are_not_expected_to_be_a_go2(
 
 def test_a_robot_of_another_kind_is_named(examined: Examined) -> None:
     """With none of the configured topics in any namespace."""
-    expect(findings(examined.foreign), 'ros.topics', 'shadowhound-data init')
+    assert_finding(findings(examined.foreign), 'ros.topics', 'shadowhound-data init')
     assert '/deaf/imu' in findings(examined.foreign)[0].seen
 
 
 def test_topics_that_are_logged_by_their_type_are_examined(examined: Examined) -> None:
     """A camera that publishes nothing is found, and no topic of a Go2 is missed; a command topic without messages is fine."""
     found = findings(examined.by_type)
-    expect([each for each in found if '/other/scan' not in each.seen], 'ros.loss', 'ros2 topic hz /other/front/image')
+    assert_finding([each for each in found if '/other/scan' not in each.seen], 'ros.loss', 'ros2 topic hz /other/front/image')
     assert '/other/scan' in {result.data.get('topic') for result in examined.by_type if result.check == 'ros.rate'}
 
 

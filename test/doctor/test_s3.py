@@ -8,7 +8,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from doctor.scene import Scene, expect
+from doctor.scene import Scene, assert_finding
 from doctor.test_network import imitated
 from open_seaweed import open_seaweed
 from shadowhound_tower.embedded import Tower
@@ -44,7 +44,7 @@ def test_a_seaweedfs_without_keys_is_named(with_tower: Scene, tmp_path: Path) ->
     with open_seaweed(tmp_path / 'open') as ports:
         with_tower.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{ports["s3"]}'
         found = with_tower.findings('network.s3', 'seaweedfs')
-        expect(found, 'seaweedfs.open', 'make tower-secrets', 'docs/tower.md')
+        assert_finding(found, 'seaweedfs.open', 'make tower-secrets', 'docs/tower.md')
         assert set(found[0].data['ports']) >= {ports[name] + 10_000 for name in ('s3', 'filer', 'master', 'volume')}
     (tmp_path / 'security.toml').write_text(make_secrets.signing_keys())
     with open_seaweed(tmp_path / 'signed', tmp_path) as ports:
