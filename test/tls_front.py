@@ -110,7 +110,7 @@ class Relay:
 
     @property
     def heard_by_connection(self) -> list[bytes]:
-        return [bytes(heard) for heard in self._heard if heard]
+        return [bytes(received) for received in self._heard if received]
 
     @property
     def connections(self) -> int:

@@ -77,8 +77,8 @@ def put_item(path: Path, key: str, bag: str, place: int) -> SpooledObject:
     metadata = {'sha256': sha256}
     if path.suffix == '.mcap':
         index = read_index(LocalFile(path))
-        told = {'messages': index.messages, 't_start_ns': index.t_start_ns, 't_end_ns': index.t_end_ns, 'slice': place}
-        metadata |= {'robot': 'thor', 'bag': bag, **{name: str(value) for name, value in told.items()}}
+        fields = {'messages': index.messages, 't_start_ns': index.t_start_ns, 't_end_ns': index.t_end_ns, 'slice': place}
+        metadata |= {'robot': 'thor', 'bag': bag, **{name: str(value) for name, value in fields.items()}}
     return SpooledObject(place, BUCKET, key, path, path.stat().st_size, sha256, 'application/octet-stream', metadata, 5, 0)
 
 

@@ -83,15 +83,17 @@ class Desk:
 
     def hear(self, numbers: range, topic: str = '/talk', size: int = 0, *, numbered: bool = True, latched: int = 0,
              publisher: str = 'p') -> None:  # fmt: skip
-        heard = batch(numbers, topic, size)._replace(latched=latched)
-        heard = heard._replace(messages=[message._replace(publisher=publisher) for message in heard.messages])
+        received = batch(numbers, topic, size)._replace(latched=latched)
+        received = received._replace(messages=[message._replace(publisher=publisher) for message in received.messages])
         if not numbered:
-            heard = heard._replace(messages=[message._replace(publisher=None, number=None) for message in heard.messages])
+            received = received._replace(
+                messages=[message._replace(publisher=None, number=None) for message in received.messages]
+            )
         with self.spool.accounts.entry(f'{BAG}{topic}') as account:
-            for message in heard.messages:
+            for message in received.messages:
                 assert account.receive(message.publisher, message.number)
-            account.gaps.newest = heard.messages[-1].times
-        dropped = self.queue.put(heard)
+            account.gaps.newest = received.messages[-1].times
+        dropped = self.queue.put(received)
         if dropped:
             self.spool.accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)
 

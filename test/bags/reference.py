@@ -59,7 +59,7 @@ def topics(folder: Path) -> dict[tuple[str, str], int | None]:
 def metadata_yaml(folder: Path, files: Mapping[str, tuple[int, int, int]] | None = None, **changed: Any) -> None:
     """As rosbag2 4 or 5 writes it; ``files`` has messages, start and duration of each."""
     names = sorted(path.name for path in folder.glob('*_[0-9].*'))
-    told = {
+    fields = {
         'version': 5, 'storage_identifier': 'mcap', 'relative_file_paths': names, 'duration': {'nanoseconds': 9 * S},
         'starting_time': {'nanoseconds_since_epoch': T0}, 'message_count': 10, 'compression_format': '', 'compression_mode': '',
         'topics_with_message_count': [
@@ -71,4 +71,4 @@ def metadata_yaml(folder: Path, files: Mapping[str, tuple[int, int, int]] | None
              'message_count': count} for name, (count, start, length) in (files or {}).items()
         ],
     }  # fmt: skip
-    (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': {**told, **changed}}))
+    (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': {**fields, **changed}}))

@@ -318,7 +318,7 @@ def storage(path: Path, version: int, messages: Sequence[tuple[int, int, bytes]]
 
 def metadata(folder: Path, files: Sequence[str], version: int, **changed: Any) -> None:
     """The fields of each version of the format."""
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         'version': version, 'storage_identifier': 'sqlite3', 'relative_file_paths': list(files), 'message_count': len(MESSAGES),
         'duration': {'nanoseconds': 8 * 10**9}, 'starting_time': {'nanoseconds_since_epoch': T0},
         'topics_with_message_count': [
@@ -329,15 +329,15 @@ def metadata(folder: Path, files: Sequence[str], version: int, **changed: Any) -
             for number, name, kind, encoding, qos, type_hash in TOPICS
         ],
     }  # fmt: skip
-    told |= {'compression_format': '', 'compression_mode': ''} if version >= 3 else {}
-    told |= {'custom_data': None} if version >= 6 else {}
-    told |= {'ros_distro': 'jazzy'} if version >= 8 else {}
+    fields |= {'compression_format': '', 'compression_mode': ''} if version >= 3 else {}
+    fields |= {'custom_data': None} if version >= 6 else {}
+    fields |= {'ros_distro': 'jazzy'} if version >= 8 else {}
     if version >= 5:
-        told['files'] = [
+        fields['files'] = [
             {'path': name, 'starting_time': {'nanoseconds_since_epoch': T0}, 'duration': {'nanoseconds': 8 * 10**9},
              'message_count': len(MESSAGES)} for name in files
         ]  # fmt: skip
-    (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': {**told, **changed}}))
+    (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': {**fields, **changed}}))
 
 
 def check(folder: Path, out: Path) -> None:
@@ -487,9 +487,9 @@ def test_a_missing_field_of_the_metadata_is_named(tmp_path: Path, field: str) ->
     """It is read from the files; a number that would be wrong without it is reported."""
     folder = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE).parent
     metadata(folder, ['b_0.db3'], 5)
-    told = json.loads((folder / 'metadata.yaml').read_text())
-    del told['rosbag2_bagfile_information'][field]
-    (folder / 'metadata.yaml').write_text(json.dumps(told))
+    data = json.loads((folder / 'metadata.yaml').read_text())
+    del data['rosbag2_bagfile_information'][field]
+    (folder / 'metadata.yaml').write_text(json.dumps(data))
     found = info_folder(folder).description
     assert (found.messages, found.t_start_ns, found.t_end_ns, found.storage) == (9, T0, T0 + 8 * 10**9, 'sqlite3')
     assert bool(found.remarks) == (field not in {'version', 'storage_identifier', 'files'})

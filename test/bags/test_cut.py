@@ -145,8 +145,8 @@ def test_a_cut_has_qos_in_humbles_format(tmp_path: Path) -> None:
     found = cut_folder(folder, tmp_path / 'piece', Choice())
     numbers = '- history: 3\n  depth: 0\n  reliability: 2\n  durability: 2\n  liveliness: 1'
     assert next(messages_of([found.folder / 'piece_0.mcap'])).channel.qos == numbers
-    told = YAML(typ='safe').load(found.folder / 'metadata.yaml')['rosbag2_bagfile_information']
-    assert told['topics_with_message_count'][0]['topic_metadata']['offered_qos_profiles'] == numbers
+    report = YAML(typ='safe').load(found.folder / 'metadata.yaml')['rosbag2_bagfile_information']
+    assert report['topics_with_message_count'][0]['topic_metadata']['offered_qos_profiles'] == numbers
 
 
 @pytest.mark.parametrize('clock', [
@@ -159,8 +159,8 @@ def test_the_clock_of_a_bag_is_that_of_its_piece(tmp_path: Path, clock: dict[str
     cut_folder(tmp_path / 'early', tmp_path / 'piece', Choice('0.05'))
     cut_folder(tmp_path / 'piece', tmp_path / 'smaller', Choice('0.05'))
     assert info_folder(tmp_path / 'smaller').description.clock == clock
-    said = CliRunner().invoke(bag, ['info', str(tmp_path / 'smaller')], standalone_mode=False).stdout
-    assert ('was not set yet' if 'clock_offset_ns' in clock else 'was never set in boot b') in said
+    text = CliRunner().invoke(bag, ['info', str(tmp_path / 'smaller')], standalone_mode=False).stdout
+    assert ('was not set yet' if 'clock_offset_ns' in clock else 'was never set in boot b') in text
 
 
 @pytest.mark.parametrize('clock', [

@@ -153,10 +153,10 @@ def test_an_invalid_manifest_is_damage(told: bytes) -> None:
 def test_an_invalid_field_of_a_manifest_is_named(tmp_path: Path, name: str, value: object) -> None:
     """And its value is truncated in the message."""
     write_ours(tmp_path / NAME, slices=1)
-    told = json.loads((tmp_path / NAME / 'manifest.json').read_bytes())
+    data = json.loads((tmp_path / NAME / 'manifest.json').read_bytes())
     sys.set_int_max_str_digits(0)
     try:
-        content = json.dumps({**told, name: value}).encode()
+        content = json.dumps({**data, name: value}).encode()
         with pytest.raises(BagDamaged) as caught:
             Manifest.from_json(content)
     finally:

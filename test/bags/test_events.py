@@ -31,12 +31,14 @@ def test_an_event_has_the_seconds_before_and_after_its_trigger(tmp_path: Path) -
         assert (done, text) == (True, f'{bag} starts')
         assert bag.startswith('event_fall_2025')
         assert in_bag(it, bag) == list(range(15, 23))
-        said = manifest(it.objects(), bag)
-        assert (said['state'], said['missing'], said['mission'], said['robot']) == ('complete', [], None, ROBOT)
-        assert {name: said['event'][name] for name in ('name', 'pre_s', 'held_s', 'post_s')} == {
+        written = manifest(it.objects(), bag)
+        assert (written['state'], written['missing'], written['mission'], written['robot']) == ('complete', [], None, ROBOT)
+        assert {name: written['event'][name] for name in ('name', 'pre_s', 'held_s', 'post_s')} == {
             'name': 'fall', 'pre_s': 5.0, 'held_s': 5.0, 'post_s': 2.0,
         }  # fmt: skip
-        assert [(one['name'], one['by'], one['detail']) for one in said['event']['triggers']] == [('fall', 'log_event', 'leg 2')]
+        assert [(one['name'], one['by'], one['detail']) for one in written['event']['triggers']] == [
+            ('fall', 'log_event', 'leg 2')
+        ]
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['open'], row['missed'], row['dropped']) == (8, 8, 0, 0, {})
         assert not list(it.root.iterdir())
@@ -290,8 +292,8 @@ def test_messages_evicted_from_the_ring_before_they_were_written_are_dropped(
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['dropped'], row['missed']) == (35, 25, {'ring_full': 10}, 0)
         assert in_bag(it, only_bag(it)) == [*range(5), *range(15, 35)]
-        said = manifest(it.objects(), only_bag(it))
-        assert missing(said) == journaled(it.spool.root, 'events') == {('/talk', 'ring_full'): 10}
+        written = manifest(it.objects(), only_bag(it))
+        assert missing(written) == journaled(it.spool.root, 'events') == {('/talk', 'ring_full'): 10}
 
 
 def test_written_messages_leave_the_ring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -373,13 +375,13 @@ def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch
     with buffer(left, clock) as it:
         bag = only_bag(it)
         assert in_bag(it, bag) == list(range(10))
-        said = manifest(it.objects(), bag)
-        assert said['state'] == 'recovered'
-        assert said['missing'][-1]['what'].startswith('messages in memory')
-        assert [one['name'] for one in said['event']['triggers']] == ['fall', 'low_battery']
+        written = manifest(it.objects(), bag)
+        assert written['state'] == 'recovered'
+        assert written['missing'][-1]['what'].startswith('messages in memory')
+        assert [one['name'] for one in written['event']['triggers']] == ['fall', 'low_battery']
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['open'], row['dropped']) == (15, 10, 0, {'restart': 5})
-        assert said['missing'][-1]['messages'] is None  # the number is known for all its topics, not for the bag
+        assert written['missing'][-1]['messages'] is None  # the number is known for all its topics, not for the bag
         assert journaled(it.spool.root, 'events') == {('/talk', 'restart'): 5}
         assert not list(it.root.iterdir())
         it.hear(range(20, 25))

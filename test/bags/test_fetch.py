@@ -63,7 +63,7 @@ def test_a_fetched_bag_is_the_uploaded_bag(store: Counting, tmp_path: Path) -> N
 
     class Sum(ProgressListener):
         total = 0
-        had = 0
+        result = 0
 
         def begin(self, total: int) -> None:
             self.total = total
@@ -71,11 +71,11 @@ def test_a_fetched_bag_is_the_uploaded_bag(store: Counting, tmp_path: Path) -> N
         def have(self, count: int) -> None:
             self.had += count
 
-    told = Sum()
-    found = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here', progress=told)
+    report = Sum()
+    found = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here', progress=report)
     assert files(found.folder) == files(tmp_path / 'robot' / NAME)
     assert (found.is_complete, found.unverified) == (True, ())
-    assert told.had == told.total == found.bytes == found.downloaded
+    assert report.had == report.total == found.bytes == found.downloaded
 
 
 def test_a_second_run_downloads_nothing(store: Counting, tmp_path: Path) -> None:

@@ -66,10 +66,10 @@ def test_each_slice_begins_with_what_is_latched(tmp_path: Path) -> None:
         first, second, third = slices(it, bag)
         assert repeats(first) == []
         assert repeats(second) == repeats(third) == [(STATIC, 2), (STATIC, 5)]
-        (heard,) = messages(range(2, 3))
+        (received,) = messages(range(2, 3))
         early = [each for each in told(second) if each.repeated]
         began_ns = messages(range(20, 21))[0].received_ns
-        assert (early[0].publish_ns, early[0].sequence) == (heard.source_ns, 2)
+        assert (early[0].publish_ns, early[0].sequence) == (received.source_ns, 2)
         assert {each.log_ns for each in early} == {began_ns - REPEAT_LEAD_NS}
         assert min(each.log_ns for each in told(second) if not each.repeated) == began_ns
 
@@ -103,10 +103,10 @@ def test_repeats_are_not_received(tmp_path: Path) -> None:
         row, found = it.row(STATIC), it.objects()
         assert (row['received'], row['stored'], row['open'], row['missed'], row['dropped']) == (2, 2, 0, 0, {})
         assert not journaled(it.spool.root, 'bags')
-        said = manifest(found, bag)
-        assert [each['counts'] for each in said['slices']] == [{STATIC: 2, '/talk': 10}] + [{STATIC: 1, '/talk': 10}] * 2
-        assert [each['repeated'] for each in said['slices']] == [{}, {STATIC: 1}, {STATIC: 1}]
-        assert said['state'] == 'complete'
+        written = manifest(found, bag)
+        assert [each['counts'] for each in written['slices']] == [{STATIC: 2, '/talk': 10}] + [{STATIC: 1, '/talk': 10}] * 2
+        assert [each['repeated'] for each in written['slices']] == [{}, {STATIC: 1}, {STATIC: 1}]
+        assert written['state'] == 'complete'
         folder = tmp_path / 'fetched'
         folder.mkdir()
         for key, path in found.items():
@@ -140,8 +140,8 @@ def test_after_a_crash_repeats_are_not_received_either(tmp_path: Path, *, is_los
         assert [(each.topic, each.repeated) for each in told(slices(it, bag)[1])] == [(STATIC, True)] + [('/talk', False)] * 10
         rows = {topic: it.row(topic) for topic in (STATIC, '/talk')}
         assert [(row['received'], row['stored'], row['open']) for row in rows.values()] == [(1, 1, 0), (20, 20, 0)]
-        said = manifest(it.objects(), bag)
-        assert [each['repeated'] for each in said['slices']] == [{}, {STATIC: 1}]
+        written = manifest(it.objects(), bag)
+        assert [each['repeated'] for each in written['slices']] == [{}, {STATIC: 1}]
 
 
 def test_a_slice_of_only_repeats_is_not_written(tmp_path: Path) -> None:

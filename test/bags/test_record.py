@@ -110,10 +110,10 @@ def test_a_recording_survives_a_damaged_index(home: Path) -> None:
         until(lambda: len(list(rosbags_of(home).glob('patrol_*/manifest.json'))) == 1, 'the first bag is whole')
         until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records again')
         child.send_signal(signal.SIGINT)
-        said = json.loads(child.communicate()[0].splitlines()[-1])
-    assert (child.returncode, said['delivered']) == (0, True)
+        data = json.loads(child.communicate()[0].splitlines()[-1])
+    assert (child.returncode, data['delivered']) == (0, True)
     folders = sorted(rosbags_of(home).iterdir())
-    assert [folder.name for folder in folders][-1] == said['bag']
+    assert [folder.name for folder in folders][-1] == data['bag']
     for folder in folders:
         manifest = Manifest.from_json((folder / 'manifest.json').read_bytes())
         assert manifest.state == 'complete'

@@ -33,9 +33,9 @@ def test_a_bag_is_recorded_from_start_to_stop(tmp_path: Path) -> None:
             f'{name}/{file}' for file in ('manifest.json', 'metadata.yaml', f'{name}_0.mcap', f'{name}_1.mcap')
         ]
         assert numbers(found[f'{name}/{name}_0.mcap']) + numbers(found[f'{name}/{name}_1.mcap']) == list(range(1, 16))
-        said = manifest(found, name)
-        assert (said['state'], said['missing'], said['mission'], said['robot']) == ('complete', [], None, ROBOT)
-        assert [entry['messages'] for entry in said['slices']] == [10, 5]
+        written = manifest(found, name)
+        assert (written['state'], written['missing'], written['mission'], written['robot']) == ('complete', [], None, ROBOT)
+        assert [entry['messages'] for entry in written['slices']] == [10, 5]
         assert (it.row()['stored'], it.row()['open'], it.row()['stored_in']['pending']) == (15, 0, 15)
         assert it.listening == [True, False]
         assert not list(it.root.iterdir())
@@ -133,8 +133,8 @@ def test_a_bag_follows_its_mission(tmp_path: Path) -> None:
         it.hear(range(3))
         it.recorder.on_mission(mission(run_id='r1'))
         it.recorder.on_mission(None)
-        said = manifest(it.objects(), bag)
-        assert said['mission'] == {'type': 'patrol', 'mission_id': 'patrol_1', 'run_id': 'r1'}
+        written = manifest(it.objects(), bag)
+        assert written['mission'] == {'type': 'patrol', 'mission_id': 'patrol_1', 'run_id': 'r1'}
         assert not it.recorder.status().recording
 
 
@@ -142,8 +142,8 @@ def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
     """If recording is always on, a mission gets a separate bag; the intake keeps listening and is informed of each bag."""
     with desk(tmp_path, record='always') as it:
         names = [it.recorder.status().bag]
-        for number, told in enumerate((None, mission(), mission(number=2), None)):
-            it.recorder.on_mission(told)
+        for number, report in enumerate((None, mission(), mission(number=2), None)):
+            it.recorder.on_mission(report)
             names.append(it.recorder.status().bag)
             it.hear(range(10 * number, 10 * number + 10))
         it.recorder.stop()
@@ -250,9 +250,9 @@ def test_the_next_start_completes_a_killed_recording(tmp_path: Path, monkeypatch
         assert sorted(found) == [f'{name}/{file}' for file in ('manifest.json', 'metadata.yaml')] + [
             f'{name}/{name}_{number}.mcap' for number in range(slices)
         ]
-        said = manifest(found, name)
-        assert said['state'] == 'recovered'
-        assert said['missing'][-1]['what'].startswith('messages in memory')
+        written = manifest(found, name)
+        assert written['state'] == 'recovered'
+        assert written['missing'][-1]['what'].startswith('messages in memory')
         row = it.row()
         assert (row['stored'], row['open'], row['dropped']) == ((30, 0, {}) if synced else (10, 0, {'restart': 20}))
         assert journaled(it.spool.root, 'bags') == ({} if synced else {('/talk', 'restart'): 20})
@@ -322,10 +322,10 @@ def test_the_state_of_a_bag_survives_the_loss_of_the_index(tmp_path: Path, deliv
             found = it.objects()
             ends.append((manifest(found, name), found[f'{name}/metadata.yaml'].read_text()))
             assert not list(it.root.iterdir())
-    (said, _), (again, _) = ends
-    assert [(entry['file'], entry['counts']) for entry in said['slices']] == [
+    (report, _), (again, _) = ends
+    assert [(entry['file'], entry['counts']) for entry in report['slices']] == [
         (f'{name}_0.mcap', {'/talk': 10}), (f'{name}_1.mcap', {'/talk': 10, '/late': 3}), (f'{name}_2.mcap', {'/talk': 5}),
     ]  # fmt: skip
-    assert (said['mission']['run_id'], said['state'], len(said['missing'])) == ('r1', 'recovered', 3)
-    assert said == again
+    assert (report['mission']['run_id'], report['state'], len(report['missing'])) == ('r1', 'recovered', 3)
+    assert report == again
     assert ends[0] == ends[1]

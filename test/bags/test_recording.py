@@ -61,14 +61,14 @@ def test_manifest_and_gap_parts_agree(tmp_path: Path) -> None:
         it.recorder.stop()
         it.row()
         bag = manifest(it.objects(), name)
-        told = Counter[tuple[str, str]]()
+        report = Counter[tuple[str, str]]()
         for part in CatalogWriter(it.spool.root, CatalogSettings(), ROBOT, Clocks()).parts():
             assert isinstance(part.body, bytes)
             for row in read_rows(part.body, part.key.partition('/')[0]).rows['_gaps'] if '/_gaps/' in part.key else ():
                 if row['what'] == 'gap':
                     assert (row['sink'], row['kind']) == ('bags', 'dropped')
-                    told[row['topic'], row['cause']] += row['count']
-        assert told == missing(bag) == {('/talk', 'no_room'): 5, ('/other', 'no_room'): 3}
+                    report[row['topic'], row['cause']] += row['count']
+        assert report == missing(bag) == {('/talk', 'no_room'): 5, ('/other', 'no_room'): 3}
 
 
 def _retry(it: Desk) -> None:
@@ -116,11 +116,11 @@ def test_a_disk_that_fails_costs_only_the_messages_it_refused(
         assert (row['received'], row['stored'], row['open']) == (20, len(kept), 0)
         assert set(row['dropped']) == {reason}
         assert kept[:5] + kept[-5:] == [*range(5), *range(15, 20)]
-        said = manifest(found, name)
-        assert said['state'] == ('gaps' if said['missing'] else 'complete')
-        assert sum(each['messages'] for each in said['missing']) == 20 - len(kept)
-        assert all((each['topic'], each['reason']) == ('/talk', reason) for each in said['missing'])
-        assert journaled(it.spool.root, 'bags') == missing(said)
+        written = manifest(found, name)
+        assert written['state'] == ('gaps' if written['missing'] else 'complete')
+        assert sum(each['messages'] for each in written['missing']) == 20 - len(kept)
+        assert all((each['topic'], each['reason']) == ('/talk', reason) for each in written['missing'])
+        assert journaled(it.spool.root, 'bags') == missing(written)
         assert ledger.imbalances(ledger.read(it.spool.root, ROBOT)) == []
 
 
@@ -137,9 +137,9 @@ def test_the_manifest_lists_the_messages_that_were_not_recorded(tmp_path: Path) 
         it.hear(range(5, 7))
         write_out(it)
         it.recorder.stop()
-        said = manifest(it.objects(), name)
-        found = Counter({(each['topic'], each['reason']): each['messages'] for each in said['missing']})
-        assert (said['state'], len(found)) == ('gaps', len(said['missing']))
+        written = manifest(it.objects(), name)
+        found = Counter({(each['topic'], each['reason']): each['messages'] for each in written['missing']})
+        assert (written['state'], len(found)) == ('gaps', len(written['missing']))
         assert found == {('/large', 'queue_full'): 2, ('/talk', 'paused'): 3, ('/talk', 'no_room'): 2}
         assert it.row()['dropped'] == {'no_room': 2}
         assert it.row('/large')['dropped'] == {'queue_full': 2}
@@ -147,8 +147,8 @@ def test_the_manifest_lists_the_messages_that_were_not_recorded(tmp_path: Path) 
         name = start(it.recorder)
         it.hear(range(7, 9))
         it.recorder.stop()
-        said = manifest(it.objects(), name)
-        assert (said['state'], said['missing']) == ('complete', [])
+        written = manifest(it.objects(), name)
+        assert (written['state'], written['missing']) == ('complete', [])
 
 
 def test_the_manifest_lists_the_slices_that_a_full_spool_evicted(tmp_path: Path) -> None:
@@ -160,16 +160,16 @@ def test_the_manifest_lists_the_slices_that_a_full_spool_evicted(tmp_path: Path)
             write_out(it)
         it.recorder.stop()
         found = it.objects()
-        said = manifest(found, name)
-        lost = {each['file']: (each['messages'], each['topic'], each['reason']) for each in said['missing']}
-        kept = {each['file'] for each in said['slices']}
+        written = manifest(found, name)
+        lost = {each['file']: (each['messages'], each['topic'], each['reason']) for each in written['missing']}
+        kept = {each['file'] for each in written['slices']}
         assert lost
         assert f'{name}_0.mcap' in lost
         assert kept == {key.partition('/')[2] for key in found if key.endswith('.mcap')}
         assert not kept & lost.keys()
         assert {(topic, reason) for _, topic, reason in lost.values()} == {(None, 'no_room')}
-        assert sum(each['messages'] for each in said['slices']) + sum(count for count, *_ in lost.values()) == 80
-        assert said['state'] == 'gaps'
+        assert sum(each['messages'] for each in written['slices']) + sum(count for count, *_ in lost.values()) == 80
+        assert written['state'] == 'gaps'
         assert f'{name}_0.mcap' not in found[f'{name}/metadata.yaml'].read_text()
         row = it.row()
         assert (row['stored'], row['stored_in']['evicted']) == (80, sum(count for count, *_ in lost.values()))

@@ -73,8 +73,8 @@ def test_without_the_index_messages_dropped_after_the_last_slice_are_missing(tmp
         now.set(NOON_NS)
         with desk(each, now) as it:
             is_whole(it)
-            said = manifest(it.objects(), 'recording_20251018_120000')
-            states.append((said['state'], sum(one['messages'] or 0 for one in said['missing'])))
+            written = manifest(it.objects(), 'recording_20251018_120000')
+            states.append((written['state'], sum(one['messages'] or 0 for one in written['missing'])))
     assert states == [('gaps', 5), ('gaps', 5)]
 
 
@@ -113,8 +113,8 @@ def test_a_row_without_a_folder_is_removed(tmp_path: Path) -> None:
     shutil.rmtree(left / 'bags' / ROBOT / name)
     with desk(left) as it:
         is_whole(it)
-        said = manifest(it.objects(), name)
-        assert (said['state'], [one['messages'] for one in said['slices']]) == ('recovered', [10])
+        written = manifest(it.objects(), name)
+        assert (written['state'], [one['messages'] for one in written['slices']]) == ('recovered', [10])
         assert it.spool.reading.recordings.rows('thor') == []
 
 
@@ -206,11 +206,11 @@ UNSET = 'recording_unsynced_this-boot_00000060'
 def hear(it: Desk, clock: Clocks, numbers: range) -> None:
     """Messages received just now, by this machine's clock."""
     came_ns = clock.wall_ns()
-    heard = [Taken(b'\0\1\0\0%08d' % number, came_ns, 'p', number, came_ns + number * 1000) for number in numbers]
+    received = [Taken(b'\0\1\0\0%08d' % number, came_ns, 'p', number, came_ns + number * 1000) for number in numbers]
     with it.spool.accounts.entry(f'{BAG_SINK}/talk') as account:
-        for message in heard:
+        for message in received:
             assert account.receive(message.publisher, message.number)
-    it.queue.put(MessageBatch('/talk', STRING, '', heard))
+    it.queue.put(MessageBatch('/talk', STRING, '', received))
 
 
 def log_times(path: Path) -> list[int]:
@@ -251,13 +251,13 @@ def test_a_bag_never_spans_the_moment_in_which_the_clock_is_set(tmp_path: Path) 
         found = it.objects()
         first, second = 'recording_20251018_115930', 'recording_20251018_120000'
         assert bags_of(found) == {first: [*range(12)], second: [12, 13, 14]}
-        said = manifest(found, first)
-        assert (said['bag'], said['state'], said['missing']) == (first, 'complete', [])
+        written = manifest(found, first)
+        assert (written['bag'], written['state'], written['missing']) == (first, 'complete', [])
         offset_ns = NOON_NS - 30 * SECOND - 70 * SECOND
-        assert said['clock'] == {
+        assert written['clock'] == {
             'known': 'set_later', 'boot_id': 'this-boot', 'boot_ns': 60 * SECOND, 'wall_ns': 70 * SECOND, 'offset_ns': offset_ns,
         }  # fmt: skip
-        assert [entry['file'] for entry in said['slices']] == [f'{first}_0.mcap', f'{first}_1.mcap']
+        assert [entry['file'] for entry in written['slices']] == [f'{first}_0.mcap', f'{first}_1.mcap']
         assert manifest(found, second)['clock'] is None
         assert f'{first}_1.mcap' in found[f'{first}/metadata.yaml'].read_text()
         assert f'clock_offset_ns: "{offset_ns}"' in found[f'{first}/metadata.yaml'].read_text()
@@ -317,8 +317,8 @@ def test_a_bag_gets_a_name_without_a_date_when_the_clock_is_not_set_in_time(tmp_
         it.recorder.split()
         found = it.objects()
         assert bags_of(found) == {UNSET: [0, 1, 2]}
-        said = manifest(found, UNSET)['clock']
-        assert (said['known'], said['offset_ns']) == ('unset', None)
+        written = manifest(found, UNSET)['clock']
+        assert (written['known'], written['offset_ns']) == ('unset', None)
         (row,) = [row for row in bag_overview(MemoryStore(), ROBOT, it.home) if row.bag == UNSET]
         assert (row.state, row.messages, row.t_start_ns) == ('complete', 3, None)
         item = next(item for item in it.spool.pending(10) if item.key.endswith('.mcap'))
@@ -354,9 +354,9 @@ def test_after_a_restart_in_the_same_boot_a_bag_still_waits_for_the_clock(tmp_pa
         is_whole(it)
         found = it.objects()
         assert bags_of(found) == {'recording_20251018_120000': [*range(5)]}
-        said = manifest(found, 'recording_20251018_120000')
-        assert (said['state'], said['clock']['known']) == ('recovered', 'set_later')
-        assert said['missing'][0]['file'] == 'recording_20251018_120000_0.mcap'
+        written = manifest(found, 'recording_20251018_120000')
+        assert (written['state'], written['clock']['known']) == ('recovered', 'set_later')
+        assert written['missing'][0]['file'] == 'recording_20251018_120000_0.mcap'
         assert (it.row()['stored'], it.row()['open'], it.row()['dropped']) == (5, 0, {})
 
 
@@ -402,9 +402,9 @@ def test_a_waiting_bag_survives_the_loss_of_the_index(tmp_path: Path) -> None:
     clock.set(NOON_NS)
     with desk(left, clock) as it:
         is_whole(it)
-        said = manifest(it.objects(), 'patrol_20251018_120000')
-        assert (said['state'], said['missing'], said['mission']['run_id']) == ('complete', [], 'r')
-        assert said['clock']['offset_ns'] == NOON_NS - 70 * SECOND
+        written = manifest(it.objects(), 'patrol_20251018_120000')
+        assert (written['state'], written['missing'], written['mission']['run_id']) == ('complete', [], 'r')
+        assert written['clock']['offset_ns'] == NOON_NS - 70 * SECOND
         assert not list(it.root.iterdir())
 
 
@@ -427,11 +427,11 @@ def test_an_event_before_the_clock_is_set_waits_for_it(tmp_path: Path) -> None:
         it.written()
         (bag,) = it.bags()
         assert bag == 'event_fall_20251018_120000'
-        said = manifest(it.objects(), bag)
+        written = manifest(it.objects(), bag)
         times = log_times(it.objects()[f'{bag}/{bag}_0.mcap'])
         assert times == [70 * SECOND, 71 * SECOND]
-        assert [trigger['at_ns'] for trigger in said['event']['triggers']] == [70 * SECOND, 71 * SECOND]
-        assert said['clock']['offset_ns'] == NOON_NS - 70 * SECOND
+        assert [trigger['at_ns'] for trigger in written['event']['triggers']] == [70 * SECOND, 71 * SECOND]
+        assert written['clock']['offset_ns'] == NOON_NS - 70 * SECOND
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['open']) == (2, 2, 0)
 

@@ -66,9 +66,9 @@ def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> Non
     for number in range(2000):
         state.add_slice(info(state.folder, number, size, topics))
         state.add_missing(Missing(slice_file(state.folder.name, number), 'dropped: queue_full', 7, '/imu', 'queue_full'))
-    said = state.record('thor', 2000)
-    assert sum(map(len, said.values())) < size // 100 + MIN_ROWS_BYTES
-    found = BagState.of_record(state.folder, 'thor', said)
+    report = state.record('thor', 2000)
+    assert sum(map(len, report.values())) < size // 100 + MIN_ROWS_BYTES
+    found = BagState.of_record(state.folder, 'thor', report)
     assert list(found.slices) == list(state.slices)[-len(found.slices) :]
     assert len(found.slices) >= (1500 if size > 1 << 20 else 10)
     assert found.missing[1:] == state.missing[1 - len(found.missing) :]

@@ -79,5 +79,5 @@ def test_times_that_python_writes_are_read(time: datetime, minutes: int) -> None
 def test_times_agree_with_gnu_date() -> None:
     """For times that both can read."""
     for text in ('2026-10-28T14:00:00+02:00', '2025-02-28 23:59:59', '20240229', '1969-12-31T23:59:59Z'):
-        told = subprocess.run(['date', '-u', '-d', text, '+%s'], capture_output=True, text=True, check=True)
-        assert moment('since', text, NOON_NS) == int(told.stdout) * SECOND
+        done = subprocess.run(['date', '-u', '-d', text, '+%s'], capture_output=True, text=True, check=True)
+        assert moment('since', text, NOON_NS) == int(done.stdout) * SECOND

@@ -77,7 +77,7 @@ Ask = Callable[[], object]
 def assert_only_tls(server: Secured, *words: bytes) -> None:
     """Nothing but TLS was on the wire, and neither these texts nor a request could be read there."""
     assert server.wire.heard_by_connection
-    assert all(heard[0] in RECORDS and heard[1] == 3 for heard in server.wire.heard_by_connection)
+    assert all(received[0] in RECORDS and received[1] == 3 for received in server.wire.heard_by_connection)
     assert not [word for word in (b'PUT /', b'AWS4-HMAC', b'authorization', *words) if word in server.wire.heard]
 
 
@@ -488,10 +488,10 @@ def test_plain_http_gets_nothing_from_that_port(
             for path in ('/', '/api/session', '/ws'):
                 reader, writer = await asyncio.open_connection('127.0.0.1', server.port)
                 writer.write(f'GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n'.encode())
-                said = b''
+                report = b''
                 with suppress(ConnectionError):
-                    said = await asyncio.wait_for(reader.read(), 60)
-                assert b'HTTP' not in said
+                    report = await asyncio.wait_for(reader.read(), 60)
+                assert b'HTTP' not in report
                 writer.close()
 
     asyncio.run(run())
@@ -541,12 +541,12 @@ async def store_page(folder: Path, robot: LiveServer, token: Path, trusted: Path
     )  # fmt: skip
     try:
         assert process.stdout is not None
-        said = b''
-        while not said.endswith(b'\n}\n'):
+        report = b''
+        while not report.endswith(b'\n}\n'):
             line = await asyncio.wait_for(process.stdout.readline(), 60)
-            assert line, said
-            said += line
-        yield SimpleNamespace(port=urlsplit(json.loads(said)['url']).port)
+            assert line, report
+            report += line
+        yield SimpleNamespace(port=urlsplit(json.loads(report)['url']).port)
     finally:
         process.terminate()
         await asyncio.wait_for(process.communicate(), 60)

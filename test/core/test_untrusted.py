@@ -201,8 +201,8 @@ def test_a_dataset_reads_nothing_outside_its_folder(tmp_path: Path, key: str, is
     root = tmp_path / 'store' / catalog.BUCKET
     (root / 'thor').mkdir(parents=True)
     (root / 'secret.jpg').write_bytes(b'secret')
-    told = {**row('camera', ROW_NOON_NS), 'key': key, 'sha256': None, 'bytes': 6}
-    bad_parts.put(folder_store(tmp_path), parts.encode([told]))
+    fields = {**row('camera', ROW_NOON_NS), 'key': key, 'sha256': None, 'bytes': 6}
+    bad_parts.put(folder_store(tmp_path), parts.encode([fields]))
     frames = lake.MissionDataset(root if is_fetched else Bucket(folder_store(tmp_path), catalog.BUCKET))
     assert len(frames) == 1
     with pytest.raises((StoreError, LakeError), match='not a path'):
@@ -263,11 +263,11 @@ def test_a_manifest_names_files_of_its_bag_alone(tmp_path: Path) -> None:
     """No other file is opened to compare it with the manifest."""
     write_ours(tmp_path / NAME, slices=1)
     path = tmp_path / NAME / 'manifest.json'
-    told = json.loads(path.read_bytes())
-    told['slices'][0]['file'] = '../secret'
+    data = json.loads(path.read_bytes())
+    data['slices'][0]['file'] = '../secret'
     with pytest.raises(BagDamaged, match='the name of a file'):
-        Manifest.from_json(json.dumps(told).encode())
-    path.write_text(json.dumps(told), encoding='utf-8')
+        Manifest.from_json(json.dumps(data).encode())
+    path.write_text(json.dumps(data), encoding='utf-8')
     found = verify_folder(tmp_path / NAME)
     assert [check.name for check in found.findings] == ['manifest.json']
     store = MemoryStore()

@@ -125,12 +125,12 @@ class House:
                 made.append(_arrived(mission, sensor, some, one))
         marks = {'mission_id': mission.name, 'run_id': f'run{mission.name}', 'mission_type': 'patrol'}
         self.drive.store(made, **marks)
-        told = {
+        fields = {
             'mission_id': mission.name, 'mission_type': 'patrol', 'mission_command': mission.task, 'success': True,
             'start': iso(mission.begin_ns), 'end': iso(mission.end_ns), 'result': 'FINISHED', 'duration_s': mission.seconds,
         }  # fmt: skip
         with closing(open_store(self.settings, UploadSettings())) as store:
-            add(store, self.folder / 'tmp', f'thor/missions/run{mission.name}/summary.json', json.dumps(told).encode())
+            add(store, self.folder / 'tmp', f'thor/missions/run{mission.name}/summary.json', json.dumps(fields).encode())
         self.tell(mission, mission.told_until_s)
         return mission
 

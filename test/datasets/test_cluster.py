@@ -110,8 +110,8 @@ def test_the_mission_of_a_killed_worker_is_given_to_another_one(house: House, wa
     """It starts again, and the files are the same."""
     process = start(house.folder, '--to', 'killed', '--json', *ON_RAY)
     assert kill_builders(process, 1) == 1
-    told, _ = finished(process)
-    assert len(json.loads(told)['added']) == 3
+    report, _ = finished(process)
+    assert len(json.loads(report)['added']) == 3
     assert contents(house.folder / 'killed') == wanted
 
 
@@ -119,8 +119,8 @@ def test_a_mission_that_no_worker_survives_is_named(house: House, wanted: dict[s
     """Nothing was added, in whatever order workers were killed; the next run gives the same files."""
     process = start(house.folder, '--to', 'dying', *ON_RAY)
     assert kill_builders(process, 100) >= 9
-    _, said = finished(process, 1)
-    assert all(f'm{number}: its worker was killed' in said for number in range(3))
+    _, report = finished(process, 1)
+    assert all(f'm{number}: its worker was killed' in report for number in range(3))
     assert not (house.folder / 'dying' / INFO).exists()
     finished(start(house.folder, '--to', 'dying', *ON_RAY))
     assert contents(house.folder / 'dying') == wanted

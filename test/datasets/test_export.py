@@ -119,9 +119,9 @@ def test_a_gap_is_flagged_exactly_at_its_ticks(exported: Exported) -> None:
     assert camera.sum() == 6
     assert odom.sum() == 2
     for tick, cause in enumerate(causes):
-        said = dict(pair.split('=') for pair in cause.split(';') if pair)
-        assert said.get('images.front') == ('transport' if camera[tick] else None)
-        assert said.get('state.pose') == ('not_published' if odom[tick] else None)
+        fields = dict(pair.split('=') for pair in cause.split(';') if pair)
+        assert fields.get('images.front') == ('transport' if camera[tick] else None)
+        assert fields.get('state.pose') == ('not_published' if odom[tick] else None)
     row = made.rows[1]
     assert json.loads(row[f'{OURS}images.front/causes']) == {'transport': 6}
     assert row[f'{OURS}images.front/stale_share'] == pytest.approx(6 / len(stamps), abs=1e-6)
@@ -140,8 +140,8 @@ def seeded_gaps(seed: int) -> tuple[Mission, dict[str, list[tuple[float, float, 
         mission.has[sensor] = lambda _, stamp, gaps=injected[sensor]: not any(
             first < (stamp - mission.begin_ns) / SECOND < last for first, last, _ in gaps
         )  # fmt: skip
-    told = [(sensor, *gap) for sensor, gaps in injected.items() for gap in gaps if gap[2]]
-    mission.gaps = [lost(mission, sensor, first, last, cause) for sensor, first, last, cause in told]
+    reports = [(sensor, *gap) for sensor, gaps in injected.items() for gap in gaps if gap[2]]
+    mission.gaps = [lost(mission, sensor, first, last, cause) for sensor, first, last, cause in reports]
     return mission, injected
 
 
@@ -158,7 +158,7 @@ def test_injected_gaps_are_flagged_at_exactly_their_ticks(tmp_path: Path, seed: 
     (ticks,), (stale,) = (rows_of(made, mission.name, name) for name in ('shadowhound.stamp_ns', 'shadowhound.stale'))
     streams = made.info['features']['shadowhound.stale']['names'] if made.info else []
     causes = pq.read_table(made.path(DATA, made.rows[0], 'data'))['shadowhound.cause'].to_pylist()
-    said = [dict(pair.split('=') for pair in cause.split(';') if pair) for cause in causes]
+    reports = [dict(pair.split('=') for pair in cause.split(';') if pair) for cause in causes]
     flagged = 0
     for sensor, stream in (('camera', 'images.front'), ('odom', 'state.pose'), ('imu', 'state.imu'), ('joints', 'state.joints')):
         published = np.array(mission.stamps(sensor))
@@ -168,11 +168,11 @@ def test_injected_gaps_are_flagged_at_exactly_their_ticks(tmp_path: Path, seed: 
         flagged += int(expected.sum())
         for number, tick in enumerate(ticks[:, 0]):
             if not expected[number]:
-                assert stream not in said[number]
+                assert stream not in reports[number]
                 continue
             at = (int(tick) - mission.begin_ns) / SECOND
             (cause,) = (cause for first, last, cause in injected[sensor] if first < at < last + 0.1)
-            assert said[number][stream] == (cause or 'not_published'), (stream, at)
+            assert reports[number][stream] == (cause or 'not_published'), (stream, at)
     assert flagged > 100
 
 
@@ -277,10 +277,10 @@ def test_every_source_has_both_times_and_a_changed_offset_is_flagged(tmp_path: P
         mission = changed if row['episode_mission'] == 'changed' else steady
         assert mission.late_ns is not None
         assert row['received_ns'] - row['stamp_ns'] == mission.late_ns(sensor, row['stamp_ns'])
-    told = {each['mission_id']: each['streams'] for each in found.added}
-    flagged = {(name, stream) for name, streams in told.items() for stream, each in streams.items() if each['offset_changed']}
+    fields = {each['mission_id']: each['streams'] for each in found.added}
+    flagged = {(name, stream) for name, streams in fields.items() for stream, each in streams.items() if each['offset_changed']}
     assert flagged == {('changed', 'state.pose'), ('changed', 'state.velocity'), ('changed', 'action')}
-    assert [told['changed']['state.pose'][name] for name in ('offset_min_s', 'offset_max_s')] == [146.0, 149.0]
+    assert [fields['changed']['state.pose'][name] for name in ('offset_min_s', 'offset_max_s')] == [146.0, 149.0]
     made = Lerobot(tmp_path / 'set')
     columns = {row[f'{OURS}mission_id']: row[f'{OURS}state.pose/offset_changed'] for row in made.rows}
     assert columns == {'changed': True, 'steady': False}
@@ -371,8 +371,8 @@ def test_labels_are_a_column_and_choose_validation(tmp_path: Path) -> None:
             if label.key is None:
                 assert json.loads(text) == ([label.label] if label.since_ns <= stamp <= label.until_ns else [])
         assert label.label in {name for text in table['shadowhound.labels'].to_pylist() for name in json.loads(text)}
-    told = pq.read_table(made.folder / LABEL_TABLE).to_pylist()
-    assert [(each['episode_mission'], each['label'], each['by'], each['width']) for each in told] == [
+    report = pq.read_table(made.folder / LABEL_TABLE).to_pylist()
+    assert [(each['episode_mission'], each['label'], each['by'], each['width']) for each in report] == [
         ('one', 'stairs; "up"', 'ann', None), ('two', 'person', 'ann', 3.0),
     ]  # fmt: skip
     before = digest_of(made.folder)
@@ -524,8 +524,8 @@ def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Pat
     drop(tmp_path / 'set', 'whole')
     made = resumed(tmp_path / 'set')
     assert made.mission_ids == ['gappy']
-    told = b''.join(contents(tmp_path / 'set').values())
-    assert b'"whole"' not in told
+    text = b''.join(contents(tmp_path / 'set').values())
+    assert b'"whole"' not in text
     table = pq.read_table(made.path(DATA, made.rows[0], 'data'))
     assert table['index'].to_pylist() == list(range(len(table)))
     assert set(table['episode_index'].to_pylist()) == {0}

@@ -398,11 +398,11 @@ def test_the_command_reports_what_was_refused(shelf: Shelf, tmp_path: Path) -> N
 
     assert run(shelf.set(numbers=(0, 1, 2))) == (
         ExitCode.FINE, '3 new episodes of arm with 360 samples, 0 in the store already.\n')  # fmt: skip
-    code, told = run(shelf.set(numbers=(0, 1)))
+    code, report = run(shelf.set(numbers=(0, 1)))
     assert code == ExitCode.FINE
-    assert told.endswith('0 new episodes of arm with 0 samples, 2 in the store already, 1 imported before are not in it.\n')
-    code, told = run(shelf.set(numbers=(0, 3, 2)))
+    assert report.endswith('0 new episodes of arm with 0 samples, 2 in the store already, 1 imported before are not in it.\n')
+    code, report = run(shelf.set(numbers=(0, 3, 2)))
     assert code == ExitCode.FINDING
-    assert f'episode 1 ({iso(begin_ns(1))}) is refused: it changed' in told
-    code, told = run(shelf.set(numbers=(0, 3, 2)), '--json')
-    assert (code, len(json.loads(told)['refused'])) == (ExitCode.FINDING, 1)
+    assert f'episode 1 ({iso(begin_ns(1))}) is refused: it changed' in report
+    code, report = run(shelf.set(numbers=(0, 3, 2)), '--json')
+    assert (code, len(json.loads(report)['refused'])) == (ExitCode.FINDING, 1)

@@ -84,26 +84,26 @@ def test_lerobot_reads_what_was_recorded(house: House, tmp_path: Path, options: 
     found = export(tmp_path / 'set', house.source, PATROLS, options)
     assert (found.refused, found.waiting) == ({}, {})
     with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
-    told = np.load(tmp_path / 'out.npz', allow_pickle=False)
+    report = np.load(tmp_path / 'out.npz', allow_pickle=False)
     count = sum(each['frames'] for each in found.added)
-    assert (int(told['episodes']), len(told['index'])) == (2, count)
-    assert told['index'].tolist() == list(range(count))
-    stamps = told['shadowhound.stamp_ns']
+    assert (int(report['episodes']), len(report['index'])) == (2, count)
+    assert report['index'].tolist() == list(range(count))
+    stamps = report['shadowhound.stamp_ns']
     column = 0
     sensor = 'odom' if options.state == ('pose',) else 'imu'
     published = np.sort(
         np.concatenate([Mission('', 100 * n, 2, jitter_ns=lambda _, k: k % 7 * 1_000_000).stamps(sensor) for n in range(2)])
     )
     newest = published[np.searchsorted(published, stamps, 'right') - 1]
-    assert told['observation.state'][:, column] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
+    assert report['observation.state'][:, column] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
     wanted = sources_of(tmp_path / 'set', house)
-    away = np.abs(told['pictures'].astype(int) - np.array(wanted).astype(int))
+    away = np.abs(report['pictures'].astype(int) - np.array(wanted).astype(int))
     assert away.max() == 0 if options.is_lossless else away.mean() < 6
-    assert told['windows'].shape == (count, 3, 3)
-    assert told['windows'][0, 1] == pytest.approx(told['action'][1])
-    assert set(told['task']) == {'walk 0', 'walk 1'}
-    assert 'action=ACTION' in told['kinds']
-    assert 'observation.state=STATE' in told['kinds']
+    assert report['windows'].shape == (count, 3, 3)
+    assert report['windows'][0, 1] == pytest.approx(report['action'][1])
+    assert set(report['task']) == {'walk 0', 'walk 1'}
+    assert 'action=ACTION' in report['kinds']
+    assert 'observation.state=STATE' in report['kinds']
 
 
 def test_two_exports_are_merged_by_lerobot(house: House, tmp_path: Path) -> None:
@@ -134,11 +134,11 @@ def test_a_robot_with_its_arm_is_loaded_by_lerobot(tmp_path: Path) -> None:
         )
     with_lerobot(tmp_path, 'merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
     with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'all'))
-    told, made = np.load(tmp_path / 'out.npz'), [Lerobot(tmp_path / f'set{number}') for number in range(2)]
+    report, made = np.load(tmp_path / 'out.npz'), [Lerobot(tmp_path / f'set{number}') for number in range(2)]
     for key in ('observation.state', 'action'):
         written = np.concatenate([each.numbers(each.rows[0], key) for each in made])
         assert written.shape[1] == 9
-        assert told[key] == pytest.approx(written)
+        assert report[key] == pytest.approx(written)
 
 
 LAYOUTS: Final = {
@@ -166,9 +166,9 @@ def test_lerobot_reads_a_dataset_in_every_way(three: dict[str, Path], tmp_path: 
     lerobot#4524: if this fails because lerobot can stream them, the layout ``shared`` is no longer needed.
     """
     with_lerobot(tmp_path, 'read', str(tmp_path / 'out.json'), str(three[layout]))
-    said = json.loads((tmp_path / 'out.json').read_text())
-    streamed = {name: said.pop(name) for name in ('streamed', 'streamed delta')}
-    assert said == {f'{how} {backend}': {'seen': 48, 'wrong': [], 'error': ''}
+    data = json.loads((tmp_path / 'out.json').read_text())
+    streamed = {name: data.pop(name) for name in ('streamed', 'streamed delta')}
+    assert data == {f'{how} {backend}': {'seen': 48, 'wrong': [], 'error': ''}
                     for backend in ('torchcodec', 'pyav') for how in ('index', 'delta')}  # fmt: skip
     for each in streamed.values():
         if layout == 'episode':
@@ -181,16 +181,16 @@ def test_lerobot_reads_a_dataset_in_every_way(three: dict[str, Path], tmp_path: 
 def test_lerobots_tools_accept_a_dataset(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
     """Each remaining frame has its numbers, and its image within the accuracy of another encoding."""
     with_lerobot(tmp_path, 'tools', str(tmp_path / 'made'), str(three[layout]))
-    said = json.loads((tmp_path / 'made/said.json').read_text())
-    streamed = said.pop('two files, streamed')
-    assert {name: each['frames'] for name, each in said.items()} == {
+    data = json.loads((tmp_path / 'made/said.json').read_text())
+    streamed = data.pop('two files, streamed')
+    assert {name: each['frames'] for name, each in data.items()} == {
         'deleted': 37, 'split/first': 11, 'split/others': 37, 'merged': 48, 'added': 48, 'removed': 48, 'tasks': 48, 'stats': 48,
         'encoded': 48, 'two files': 48,
     }  # fmt: skip
-    assert {each['numbers'] for each in said.values()} == {0.0}
-    assert max(each['pictures'] for each in said.values()) < 0.02
-    assert all(each['pictures'] == 0 for name, each in said.items() if name in {'added', 'removed', 'tasks', 'stats'})
-    assert (said['tasks']['tasks'], said['stats']['tasks']) == (['sit'], ['walk 0', 'walk 1'])
+    assert {each['numbers'] for each in data.values()} == {0.0}
+    assert max(each['pictures'] for each in data.values()) < 0.02
+    assert all(each['pictures'] == 0 for name, each in data.items() if name in {'added', 'removed', 'tasks', 'stats'})
+    assert (data['tasks']['tasks'], data['stats']['tasks']) == (['sit'], ['walk 0', 'walk 1'])
     if layout != 'lossless':  # lerobot cannot stream what it puts into two files itself either
         assert streamed['wrong'] or streamed['error']
 

@@ -89,14 +89,14 @@ def test_frames_are_listed_in_a_table(task: tuple[Path, Exported]) -> None:
 def test_detections_are_exported_and_a_mission_is_dropped(house: House, tmp_path: Path) -> None:
     """By episode, with their source objects; a dropped mission leaves nothing behind."""
     mission = Mission('', begin_s=100, seconds=2)
-    told: dict[str, Any] = {'samples': [{'stamp_ns': mission.begin_ns + 10, 'detections': [{'id': 'cup'}]}]}
+    fields: dict[str, Any] = {'samples': [{'stamp_ns': mission.begin_ns + 10, 'detections': [{'id': 'cup'}]}]}
     made = house.drive.one(
         'sensor_msgs/msg/JointState', [mission.begin_ns + 10], [house.drive._ros.cdr('sensor_msgs/msg/JointState')]
     )
     metadata = {**made.metadata, 'sensor': 'detections', 'topic': '/detections', 'type': DETECTION}
     key = made.key.replace('joints', 'detections')
     with closing(open_store(house.settings, UploadSettings())):
-        house.drive.store([replace(made, key=key, body=json.dumps(told).encode(), metadata=metadata)])
+        house.drive.store([replace(made, key=key, body=json.dumps(fields).encode(), metadata=metadata)])
     task = tmp_path / 'fetch'
     assert export(task / SET, house.source, {}, ExportOptions(state=('velocity',))).absent == []
     found = json.loads((task / 'synchronized/detections.json').read_text())['episodes']

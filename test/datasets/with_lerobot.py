@@ -62,10 +62,10 @@ def load(out: str, folder: str) -> None:
     batches = DataLoader(windows, batch_size=16, shuffle=False)
     actions = [np.asarray(batch['action']) for batch in batches]
     kinds = {name: feature.type.value for name, feature in dataset_to_policy_features(plain.meta.features).items()}
-    told = {name: np.array(values) for name, values in found.items() if name != CAMERA}
+    fields = {name: np.array(values) for name, values in found.items() if name != CAMERA}
     images = (np.array(found[CAMERA]) * 255).round().astype(np.uint8)
     np.savez(out, images=images.transpose(0, 2, 3, 1), windows=np.concatenate(actions), episodes=plain.num_episodes,
-             kinds=np.array([f'{name}={kind}' for name, kind in kinds.items()]), **told)  # fmt: skip
+             kinds=np.array([f'{name}={kind}' for name, kind in kinds.items()]), **fields)  # fmt: skip
 
 
 def merge(out: str, *folders: str) -> None:
@@ -81,17 +81,17 @@ def read(out: str, folder: str) -> None:
     wanted = opened(folder, video_backend='pyav')
     frames = [wanted[number] for number in range(len(wanted))]
     bounds = [(row['dataset_from_index'], row['dataset_to_index']) for row in wanted.meta.episodes]
-    said = {}
+    fields = {}
     for backend in ('torchcodec', 'pyav'):
         plain = opened(folder, video_backend=backend)
-        said[f'index {backend}'] = compared((plain[number] for number in range(len(plain))), frames)
+        fields[f'index {backend}'] = compared((plain[number] for number in range(len(plain))), frames)
         windows = opened(folder, video_backend=backend, delta_timestamps=delta_of(plain.fps))
         loader = DataLoader(windows, batch_size=None, shuffle=False, num_workers=2)
-        said[f'delta {backend}'] = compared(loader, frames, bounds)
+        fields[f'delta {backend}'] = compared(loader, frames, bounds)
     for name, how in {'streamed': {}, 'streamed delta': {'delta_timestamps': {CAMERA: [-1 / wanted.fps, 0.0]}}}.items():
         stream = StreamingLeRobotDataset('local/set', root=folder, shuffle=False, buffer_size=8, **how)
-        said[name] = compared(stream, frames, bounds if how else None)
-    Path(out).write_text(json.dumps(said))
+        fields[name] = compared(stream, frames, bounds if how else None)
+    Path(out).write_text(json.dumps(fields))
 
 
 def compared(found: Iterable[Mapping[str, Any]], frames: list[Mapping[str, Any]], bounds: Any = None) -> dict[str, Any]:
@@ -148,11 +148,11 @@ def edited(out: str, folder: str) -> None:
                        aggr_root=made / 'two files', concatenate_videos=False)  # fmt: skip
     before = {int(item['shadowhound.stamp_ns']): item for item in (plain[number] for number in range(len(plain)))}
     names = ['deleted', 'split/first', 'split/others', 'merged', 'added', 'removed', 'tasks', 'stats', 'encoded', 'two files']
-    said: dict[str, Any] = {name: difference(opened(made / name), before) for name in names}
+    fields: dict[str, Any] = {name: difference(opened(made / name), before) for name in names}
     merged = [opened(made / 'two files')[number] for number in range(len(plain))]
     stream = StreamingLeRobotDataset('local/set', root=made / 'two files', shuffle=False, buffer_size=1)
-    said['two files, streamed'] = compared(stream, merged)
-    (made / 'said.json').write_text(json.dumps(said))
+    fields['two files, streamed'] = compared(stream, merged)
+    (made / 'said.json').write_text(json.dumps(fields))
 
 
 def difference(made: LeRobotDataset, before: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:

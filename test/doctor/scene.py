@@ -121,12 +121,12 @@ class Scene:
 
 def assert_finding(found: list[Result], name: str, *words: str) -> None:
     """The only finding, by its name, with a remedy that contains this text."""
-    told = [f'{result.check}: {result.seen} | {result.cause} -> {result.remedy}' for result in found]
-    assert [result.check for result in found] == [name], told or 'nothing was found'
-    assert found[0].seen, told
-    assert found[0].cause, told
+    reports = [f'{result.check}: {result.seen} | {result.cause} -> {result.remedy}' for result in found]
+    assert [result.check for result in found] == [name], reports or 'nothing was found'
+    assert found[0].seen, reports
+    assert found[0].cause, reports
     missing = [word for word in words if word not in found[0].remedy]
-    assert not missing, told
+    assert not missing, reports
 
 
 def scenes(tmp_path: Path) -> Iterator[Scene]:

@@ -322,13 +322,13 @@ def test_a_robot_with_cyclone_dds_is_checked_through_the_nodes_rmw(robot: Scene)
     """Through Fast DDS, with the maximum buffer of the kernel, whatever Cyclone DDS would request."""
     robot.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
     assert robot.findings('sockets') == []
-    (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
-    assert told.seen.startswith(
+    (report,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
+    assert report.seen.startswith(
         "the node would listen with rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp: Fast DDS reports"
     )
     robot.run_node(middleware=beside(rmw='rmw_cyclonedds_cpp', why="the robot's own", asked='robot', receive_bytes=MEBI))
-    (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
-    assert told.seen == "the node listens with rmw_cyclonedds_cpp (the robot's own); capture.rmw is robot"
+    (report,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
+    assert report.seen == "the node listens with rmw_cyclonedds_cpp (the robot's own); capture.rmw is robot"
     assert [result.check for result in robot.findings('sockets')] == ['sockets.cyclone']
 
 
@@ -387,12 +387,12 @@ def test_the_default_domain_is_that_of_a_shell_without_one(robot: Scene) -> None
 def test_no_password_is_shown(robot: Scene, name: str, url: str) -> None:
     """The password of a URL: neither a database's nor a mistyped one's."""
     robot.environ[name] = url
-    told = json.dumps(
+    report = json.dumps(
         [result.as_dict() for result in robot.ask('environment', 'secrets', 'network.s3', 'network.mlflow', 'mlflow')]
     )
-    assert 'ter2' not in told
-    assert 'crash' not in told
-    assert f'{name} contains a user and a password' in told
+    assert 'ter2' not in report
+    assert 'crash' not in report
+    assert f'{name} contains a user and a password' in report
 
 
 def test_a_slow_disk_is_named_within_its_deadline(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

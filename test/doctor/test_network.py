@@ -130,13 +130,13 @@ def test_the_usual_port_is_proposed(with_tower: Scene, monkeypatch: pytest.Monke
 
 def test_every_address_of_a_name_is_tried(with_tower: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The server may listen on the second only, as on 127.0.0.1 if ``localhost`` is ::1 first: clients reach it."""
-    told = [
+    reports = [
         (socket.AF_INET6, socket.SOCK_STREAM, 6, '', ('::1', 0, 0, 0)),
         (socket.AF_INET, socket.SOCK_STREAM, 6, '', ('127.0.0.1', 0)),
     ]
     asked = socket.getaddrinfo
     monkeypatch.setattr(
-        network.socket, 'getaddrinfo', lambda host, *rest, **how: told if host == 'localhost' else asked(host, *rest, **how)
+        network.socket, 'getaddrinfo', lambda host, *rest, **how: reports if host == 'localhost' else asked(host, *rest, **how)
     )
     with_tower.environ['AWS_ENDPOINT_URL'] = with_tower.environ['AWS_ENDPOINT_URL'].replace('127.0.0.1', 'localhost')
     assert with_tower.findings('network.s3') == []

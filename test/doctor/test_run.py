@@ -132,7 +132,7 @@ def test_without_a_network_the_examination_ends_in_time(scene: Scene, monkeypatc
     took = time.monotonic() - began
     over.set()
     assert took < 60.0
-    told = {result.check: result.severity for result in found}
-    assert told['network.s3.deadline'] == told['network.mlflow.deadline'] == Severity.ERROR
-    assert told['s3'] == told['mlflow'] == Severity.SKIPPED
-    assert told['node.running'] == Severity.WARNING
+    fields = {result.check: result.severity for result in found}
+    assert fields['network.s3.deadline'] == fields['network.mlflow.deadline'] == Severity.ERROR
+    assert fields['s3'] == fields['mlflow'] == Severity.SKIPPED
+    assert fields['node.running'] == Severity.WARNING

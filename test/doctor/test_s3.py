@@ -75,10 +75,10 @@ def test_minio_is_mentioned_without_a_finding(with_tower: Scene, monkeypatch: py
     """Such Towers keep working; the result explains that it is no longer maintained."""
     monkeypatch.setattr('stores.fake_s3.Handler.version_string', lambda _: 'MinIO')
     imitated()(with_tower)
-    told = {result.check: result for result in with_tower.ask('s3')}
-    assert told['s3.server'].severity is Severity.INFO
-    assert 'archived' in told['s3.server'].cause
-    assert 'SeaweedFS' in told['s3.server'].remedy
+    fields = {result.check: result for result in with_tower.ask('s3')}
+    assert fields['s3.server'].severity is Severity.INFO
+    assert 'archived' in fields['s3.server'].cause
+    assert 'SeaweedFS' in fields['s3.server'].remedy
 
 
 NAMES = [f'{number:032x}' for number in range(s3.RACES)]

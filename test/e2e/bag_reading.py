@@ -40,13 +40,13 @@ class Bag:
     def check(self) -> Counter[str]:
         """All readers find the same, in agreement with the manifest; topic -> messages."""
         counts: Counter[str] = Counter()
-        for said in self.manifest['slices']:
-            path = self.folder / said['file']
-            assert hashlib.sha256(path.read_bytes()).hexdigest() == said['sha256'], path
+        for report in self.manifest['slices']:
+            path = self.folder / report['file']
+            assert hashlib.sha256(path.read_bytes()).hexdigest() == report['sha256'], path
             found = Counter(message.topic for message in in_slice(path))
-            assert found == Counter(said['counts']), path
+            assert found == Counter(report['counts']), path
             counts += found
-        assert [said['file'] for said in self.manifest['slices']] == [path.name for path in self.slices]
+        assert [report['file'] for report in self.manifest['slices']] == [path.name for path in self.slices]
         with AnyReader([self.folder]) as reader:
             assert {topic: info.msgcount for topic, info in reader.topics.items()} == counts
             assert sum(1 for _ in reader.messages()) == counts.total()

@@ -283,8 +283,8 @@ class Processes:
         command = [*program, 'live', '--json', '--port', str(port), *arguments]
         page = self._keep(Process(name, command, self.folder / f'{name}.log', environ))
         page.await_log('"problem"')
-        said = page.log
-        return page, json.loads(said[said.index('{') : said.rindex('}') + 1])['url']
+        text = page.log
+        return page, json.loads(text[text.index('{') : text.rindex('}') + 1])['url']
 
     def witness(self, topics: Mapping[str, str], output: Path, *, best_effort: Iterable[str] = ()) -> Process:
         """A second subscriber that writes everything it receives, unchanged, to a file (witness.py); SIGTERM stops it."""

@@ -52,27 +52,27 @@ class Session:
         node = processes.node(seaweed.environment(), parameters)
         recording = processes.folder / 'witness'
         witness = processes.witness(TYPES, recording, best_effort=BEST_EFFORT)
-        said = published(processes.sim(f'duration_s:={DURATION_S}'), DURATION_S + WAIT_S)
+        report = published(processes.sim(f'duration_s:={DURATION_S}'), DURATION_S + WAIT_S)
         ledger = node.stop()
         ended_ns = time.time_ns()
         for topic in BEST_EFFORT:
             counted = ledger['topics'][topic]['published']
-            if counted is not None and is_accounted(counted, said[topic]):
-                said[topic] = counted
+            if counted is not None and is_accounted(counted, report[topic]):
+                report[topic] = counted
         witness.signal(signal.SIGTERM)
         assert witness.wait() == 0
-        heard = by_topic(recorded(recording))
+        received = by_topic(recorded(recording))
         (bag,) = bags(store, processes.robot, processes.folder / 'bags')
         objects = Objects.of(store, 'sensor-data', processes.robot).without(f'{processes.robot}/rosbags/')
         return cls(
             node,
             processes.folder,
             processes.robot,
-            said,
+            report,
             ledger,
             ended_ns,
-            heard,
-            _by_stamp(heard),
+            received,
+            _by_stamp(received),
             objects,
             bag,
             by_topic(bag.messages()),

@@ -85,16 +85,16 @@ class Station:
 
     def diagnostics(self) -> dict[str, Any]:
         """The next message on ``/diagnostics``: its entries by name."""
-        heard: list[DiagnosticArray] = []
-        subscription = self.node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 1)
+        received: list[DiagnosticArray] = []
+        subscription = self.node.create_subscription(DiagnosticArray, '/diagnostics', received.append, 1)
         try:
             end_ns = self.node.get_clock().now().nanoseconds + round(WAIT_S * 1e9)
-            while not heard:
+            while not received:
                 self._executor.spin_once(timeout_sec=0.5)
                 assert self.node.get_clock().now().nanoseconds < end_ns, 'there are no diagnostics'
         finally:
             self.node.destroy_subscription(subscription)
-        return {entry.name: entry for entry in heard[0].status}
+        return {entry.name: entry for entry in received[0].status}
 
     def answers(self, seconds: float) -> bool:
         """Whether ``~/flush`` responds in that time. A call may still be sent to a killed server in the graph."""

@@ -36,14 +36,16 @@ def test_every_message_is_in_the_bag_as_published(session: Session, topic: str) 
     The first ones on a robot with another RMW may be in any order: one of a new node's two subscriptions gets messages from
     before it discovered the publisher, the other one new messages at the same time.
     """
-    found, heard = session.messages[topic], session.heard[topic]
-    decoded = [decode(TYPES[topic], message.cdr) for message in heard]
-    stamps = [stamp_ns(one) if hasattr(one, 'header') else message.source_ns for one, message in zip(decoded, heard, strict=True)]
+    found, received = session.messages[topic], session.heard[topic]
+    decoded = [decode(TYPES[topic], message.cdr) for message in received]
+    stamps = [
+        stamp_ns(one) if hasattr(one, 'header') else message.source_ns for one, message in zip(decoded, received, strict=True)
+    ]
     assert len(found) == session.said[topic]
     if session.node.is_beside:
         found = sorted(found, key=lambda message: message.publish_ns)
     assert [message.publish_ns for message in found] == stamps
-    assert [message.cdr for message in found] == [message.cdr for message in heard]
+    assert [message.cdr for message in found] == [message.cdr for message in received]
     assert all(0 <= message.log_ns - message.publish_ns < SOON_NS for message in found)
     assert len({message.sequence for message in found}) == len(found)
 
@@ -52,8 +54,8 @@ def test_bags_are_a_separate_sink_in_the_ledger(session: Session) -> None:
     """Everything published was recorded and delivered, whichever messages the sensors kept."""
     assert set(session.ledger['bags']) == set(TYPES)
     for topic, row in session.ledger['bags'].items():
-        known, said = session.node.known, session.said[topic]
-        assert (topic, row['published'], row['received'], row['missed']) == (topic, known(said), said, known(0))
+        known, report = session.node.known, session.said[topic]
+        assert (topic, row['published'], row['received'], row['missed']) == (topic, known(report), report, known(0))
         assert (row['stored'], row['stored_in']['delivered'], row['open']) == (row['received'], row['received'], 0)
     camera = session.ledger['topics']['/camera/compressed']
     assert camera['stored'] <= DURATION_S + 2
@@ -108,7 +110,7 @@ def test_the_services_start_pause_split_and_stop_a_bag(
     assert bag.folder.name == name
     assert bag.check() == {'/b_one': 30}
     assert [int(decode(STRING, message.cdr).data) for message in bag.messages()] == [*range(20), *range(30, 40)]
-    assert [said['messages'] for said in bag.manifest['slices']] == [20, 10]
+    assert [report['messages'] for report in bag.manifest['slices']] == [20, 10]
     assert ledger['bags']['/b_one']['dropped'] == {'paused': 10}
     assert missing(bag.manifest) == journaled(node.home / 'spool', 'bags') == {('/b_one', 'paused'): 10}
     assert '/b_one' not in ledger['topics']

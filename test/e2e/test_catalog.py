@@ -42,8 +42,8 @@ def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
     found = {}
     for bucket in ('sensor-data', 'trajectories'):
         for info in store.list(bucket, f'{robot}/'):
-            if catalog.is_row(bucket, info.key) and (told := store.head(bucket, info.key)) is not None:
-                found[bucket, info.key] = told
+            if catalog.is_row(bucket, info.key) and (report := store.head(bucket, info.key)) is not None:
+                found[bucket, info.key] = report
     return found
 
 
@@ -108,14 +108,14 @@ def test_every_object_has_one_row_and_the_right_pose(session: Session, store: S3
 
 def judge_gaps(source: Bucket, robot: str, ledger: dict[str, Any]) -> None:
     """The gaps in the store add up to the ledger, and the watermark covers them."""
-    told = Counter[tuple[str, str, str]]()
+    report = Counter[tuple[str, str, str]]()
     for row in lake.sql('SELECT sink, topic, kind, count FROM gaps', source, robot=robot).to_pylist():
-        told[row['sink'], row['topic'], row['kind']] += row['count']
+        report[row['sink'], row['topic'], row['kind']] += row['count']
     for sink, accounts in (('objects', ledger['topics']), ('bags', ledger['bags'])):
         for topic, account in accounts.items():
-            missed = account['missed'] if account['missed'] is not None else told[sink, topic, 'missed']
+            missed = account['missed'] if account['missed'] is not None else report[sink, topic, 'missed']
             figures = missed, sum(account['dropped'].values()), sum(account['rejected'].values())
-            assert tuple(told[sink, topic, kind] for kind in ('missed', 'dropped', 'rejected')) == figures, topic
+            assert tuple(report[sink, topic, kind] for kind in ('missed', 'dropped', 'rejected')) == figures, topic
 
 
 def spans(source: Bucket, robot: str, topic: str) -> list[tuple[int, int]]:

@@ -159,14 +159,14 @@ def check_dates(robot: Robot, objects: Objects) -> None:
     """Each message's time, as the metadata of its object dates it, is that of its group."""
     found: dict[int, int] = {}
     for key, info in objects.infos.items():
-        said = info.metadata
-        start_ns, end_ns = int(said['t_start_ns']), int(said['t_end_ns'])
+        report = info.metadata
+        start_ns, end_ns = int(report['t_start_ns']), int(report['t_end_ns'])
         assert key.split('/')[3].startswith(time.strftime('%H%M%S', time.gmtime(start_ns / SECOND)))
-        assert start_ns - int(said['boot_start_ns']) == pytest.approx(end_ns - int(said['boot_end_ns']), abs=RIGHT_NS)
-        assert start_ns - int(said['boot_start_ns']) == pytest.approx(offset_ns(), abs=RIGHT_NS)
+        assert start_ns - int(report['boot_start_ns']) == pytest.approx(end_ns - int(report['boot_end_ns']), abs=RIGHT_NS)
+        assert start_ns - int(report['boot_start_ns']) == pytest.approx(offset_ns(), abs=RIGHT_NS)
         if key.split('/')[1] == 'talk':
             for sample in json.loads(objects.contents[key])['samples']:
-                found[int(sample['data'])] = sample['stamp_ns'] + int(said.get('clock_offset_ns', 0))
+                found[int(sample['data'])] = sample['stamp_ns'] + int(report.get('clock_offset_ns', 0))
     assert sorted(found) == list(range(len(robot.spans) * GROUP))
     for number, stamp_ns in found.items():
         began_ns, ended_ns = robot.spans[number // GROUP]

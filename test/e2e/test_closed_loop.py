@@ -103,9 +103,9 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
     processes.sim('obey:=true', 'image_raw:=false', GENTLE)
     until(lambda: node.topic('/odom').get('received', 0) > 0, "the robot's messages are received")
     station = Station(processes.environ)
-    told = station.node.create_publisher(Twist, 'cmd_vel', 1)
-    heard: list[Odometry] = []
-    station.node.create_subscription(Odometry, 'odom', heard.append, 10)
+    report = station.node.create_publisher(Twist, 'cmd_vel', 1)
+    received: list[Odometry] = []
+    station.node.create_subscription(Odometry, 'odom', received.append, 10)
 
     def newest() -> MissionFolder:
         return max(missions(node.home), key=lambda one: one.mission_id)
@@ -133,21 +133,21 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
     # A person drives, and everything is recorded.
     command = Twist()
     command.linear.x, command.angular.z = FORWARD, TURN
-    until(lambda: told.get_subscription_count() == 2, 'robot and node listen to the teacher')
+    until(lambda: report.get_subscription_count() == 2, 'robot and node listen to the teacher')
     begun = time.monotonic()
 
     def went() -> bool:
-        return time.monotonic() - begun > 8.0 and any(one.pose.pose.position.x > 0.5 for one in heard)
+        return time.monotonic() - begun > 8.0 and any(one.pose.pose.position.x > 0.5 for one in received)
 
-    taught = mission(f'taught {robot}', went, lambda: told.publish(command))
+    taught = mission(f'taught {robot}', went, lambda: report.publish(command))
     # The mission becomes a dataset, and the dataset a policy.
     asked = ('query', "SELECT count(*) AS rows FROM objects WHERE sensor = 'cmd_vel'", '--mission', taught, '--json')
     until(lambda: sum(row['rows'] for row in run(*asked)), 'the catalog has arrived')
     exported = tmp_path / policy
     (tmp_path / 'export.yaml').write_text('max_stale: 1\ncodec: h264\n')
-    said = run('export', 'lerobot', policy, '--robot', robot, '--mission', taught, '--wait', '--allow-gaps',
+    text = run('export', 'lerobot', policy, '--robot', robot, '--mission', taught, '--wait', '--allow-gaps',
         '--config', str(tmp_path / 'export.yaml'))  # fmt: skip
-    assert (exported / 'meta/info.json').is_file(), said
+    assert (exported / 'meta/info.json').is_file(), text
     digest = fitted(exported, tmp_path / 'trained')
     packed = str(tmp_path / 'packed')
     root = run('policy', 'keys', '--json')['root']
@@ -172,15 +172,15 @@ def test_a_policy_trained_on_a_recording_drives_the_robot(  # noqa: PLR0915 - on
     driver = Process('driver', [str(ROOT / 'examples/policy_node.py')], tmp_path / 'driver.log', of_driver)
     processes.started.append(driver)
     driver.await_log(f'{made} drives')
-    before = heard[-1].pose.pose.position
+    before = received[-1].pose.pose.position
 
     def gone() -> bool:
-        now = heard[-1].pose.pose.position
+        now = received[-1].pose.pose.position
         return (now.x - before.x) ** 2 + (now.y - before.y) ** 2 > 0.5**2
 
     driven = mission(f'driven {robot}', gone)
     driver.kill()
-    until(lambda: heard[-1].twist.twist.linear.x == 0.0 or station.spin(), 'without its policy the robot stops')
+    until(lambda: received[-1].twist.twist.linear.x == 0.0 or station.spin(), 'without its policy the robot stops')
     # The policy that drove, and its training data.
     server = Server(tower, None)  # type: ignore[arg-type]  # no wire
     assert server.run(f'driven {robot}').data.params['policy'] == made

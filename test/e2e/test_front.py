@@ -178,18 +178,18 @@ def test_front_and_command_line_see_each_other_s_settings(nodes: dict[str, Node]
 
 def test_the_front_publishes_the_nodes_state(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
     """``/diagnostics`` has the same entries, with the robot as hardware."""
-    heard: dict[str, Any] = {}
+    received: dict[str, Any] = {}
 
     def all_heard() -> bool:
-        heard.update(stations[BESIDE].diagnostics())
-        return {name.partition('/')[0] for name in heard} == {'direct', 'beside'}
+        received.update(stations[BESIDE].diagnostics())
+        return {name.partition('/')[0] for name in received} == {'direct', 'beside'}
 
     until(all_heard, 'both tell how they are')
-    entries = {space: {name.partition(':')[2].replace(space, '') for name in heard if name.startswith(space[1:])}
+    entries = {space: {name.partition(':')[2].replace(space, '') for name in received if name.startswith(space[1:])}
                for space in nodes}  # fmt: skip
     assert entries[BESIDE] - {'/talk'} == entries[DIRECT] - {'/talk'}
-    assert {entry.hardware_id for name, entry in heard.items() if name.startswith('beside')} == {nodes[BESIDE].robot}
-    assert all(isinstance(pair.value, str) for entry in heard.values() for pair in entry.values)
+    assert {entry.hardware_id for name, entry in received.items() if name.startswith('beside')} == {nodes[BESIDE].robot}
+    assert all(isinstance(pair.value, str) for entry in received.values() for pair in entry.values)
 
 
 def test_only_a_front_compares_publishers(nodes: dict[str, Node]) -> None:
@@ -208,18 +208,18 @@ def test_only_a_front_compares_publishers(nodes: dict[str, Node]) -> None:
 def test_the_front_publishes_missions(nodes: dict[str, Node], stations: dict[str, Station]) -> None:
     """Latched, at the start and at the end."""
     node, station = nodes[BESIDE], stations[BESIDE]
-    heard: list[str] = []
+    received: list[str] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     subscription = station.node.create_subscription(
-        String, f'{BESIDE}/sensor_logger_node/mission', lambda told: heard.append(told.data), latched
+        String, f'{BESIDE}/sensor_logger_node/mission', lambda told: received.append(told.data), latched
     )
     logger = MissionDataLogger(home=node.home, robot=node.robot, replay=False, start_timeout_s=0.0)
     try:
-        until(lambda: station.spin() or heard == [''], 'none is active')
+        until(lambda: station.spin() or received == [''], 'none is active')
         mission_id = logger.start_mission('patrol', 'go round')
-        until(lambda: station.spin() or mission_id in heard[-1], 'it is active')
+        until(lambda: station.spin() or mission_id in received[-1], 'it is active')
         logger.end_mission(True, 0.0, 0.0)
-        until(lambda: station.spin() or heard[-1] == '', 'it is over')
+        until(lambda: station.spin() or received[-1] == '', 'it is over')
     finally:
         logger.close()
         station.node.destroy_subscription(subscription)

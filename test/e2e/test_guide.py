@@ -289,10 +289,10 @@ def test_the_guides_executor_and_query_run_unchanged(
         exec(QUERY.replace('http://TOWER_IP:5001', server.tower.tracking_uri), {})  # noqa: S102
     finally:
         mlflow.set_tracking_uri('')
-    said = capsys.readouterr().out
+    captured = capsys.readouterr().out
     for command, distance, success in (('patrol by the guide', 12.5, 1.0), ('patrol into the pond', 0.0, 0.0)):
         run_id = server.run(command).info.run_id
-        assert f'Run ID: {run_id}\n  Command: {command}\n  Distance: {distance} m\n  Success: {success}\n' in said
+        assert f'Run ID: {run_id}\n  Command: {command}\n  Distance: {distance} m\n  Success: {success}\n' in captured
     run_id = server.run('patrol by the guide').info.run_id
     assert {'camera/frame_000000.jpg', 'trajectories/trajectory.csv', 'trajectory.png'} <= server.artifacts(run_id)
 

@@ -47,8 +47,8 @@ def settings() -> dict[str, Any]:
 
 def commands() -> list[list[str]]:
     """Those of the patrol, in order."""
-    told = PAGE.partition('## A patrol')[2].partition('\n## ')[0]
-    return [shlex.split(line) for line in re.findall(r'`shadowhound-data ([^`]+)`', told.replace('\n   ', ' '))]
+    report = PAGE.partition('## A patrol')[2].partition('\n## ')[0]
+    return [shlex.split(line) for line in re.findall(r'`shadowhound-data ([^`]+)`', report.replace('\n   ', ' '))]
 
 
 def patrols(processes: Processes, node: Node) -> None:
@@ -120,8 +120,8 @@ def test_the_commands_of_the_page_on_keeping_data_work(  # noqa: PLR0915 - one s
         assert len([name for name in one.getnames() if name.endswith('.jpg')]) > 1
     # Train.
     run(export)
-    told = json.loads((tmp_path / 'go2_patrol/meta/info.json').read_bytes())
-    assert told['total_episodes'] == 1
+    data = json.loads((tmp_path / 'go2_patrol/meta/info.json').read_bytes())
+    assert data['total_episodes'] == 1
     assert run([*poll, '--mission-type', 'patrol'], '--json')['objects'] == 0
     flags = {'robot': processes.robot, 'mission_type': 'patrol', 'since': 'today'}
     made = MissionDataset(**flags, pull=True)

@@ -70,20 +70,20 @@ class Towers:
         rows = []
         with closing(open_store(tower.store_settings(), UploadSettings())) as store:
             for (bucket, key), body in bodies.items():
-                told = {'robot': 'thor', 't_start_ns': str(NOON_NS)}
-                add(store, self.tmp / 'tmp', key, body, told, bucket=bucket, content_type='image/jpeg')
-                told['sha256'] = hashlib.sha256(body).hexdigest()
-                rows.append(catalog_rows.row_of(bucket, key, len(body), 'image/jpeg', told))
+                fields = {'robot': 'thor', 't_start_ns': str(NOON_NS)}
+                add(store, self.tmp / 'tmp', key, body, fields, bucket=bucket, content_type='image/jpeg')
+                fields['sha256'] = hashlib.sha256(body).hexdigest()
+                rows.append(catalog_rows.row_of(bucket, key, len(body), 'image/jpeg', fields))
             add_part(store, rows, name, self.tmp / 'tmp')
 
     def copy(self) -> str:
         """With the documented command; rclone's output."""
-        said = re.search(r'^ +(rclone copy .*) old:sensor-data new:sensor-data$', DOCS.read_text(encoding='utf-8'), re.MULTILINE)
-        assert said
+        text = re.search(r'^ +(rclone copy .*) old:sensor-data new:sensor-data$', DOCS.read_text(encoding='utf-8'), re.MULTILINE)
+        assert text
         ours = {name: value for name, value in os.environ.items() if not name.startswith(('AWS_', 'RCLONE_'))}
         environ = {**ours, **remote('OLD', self.old), **remote('NEW', self.new), 'RCLONE_CONFIG': os.devnull}
         ran = [
-            subprocess.run([*said[1].split(), '-v', f'old:{bucket}', f'new:{bucket}'], env=environ, check=True,
+            subprocess.run([*text[1].split(), '-v', f'old:{bucket}', f'new:{bucket}'], env=environ, check=True,
                            capture_output=True, text=True)
             for bucket in BUCKETS
         ]  # fmt: skip
@@ -97,9 +97,9 @@ class Towers:
 
     def verify(self, *arguments: str) -> dict[str, list[str]]:
         """Verification of the new one: kind -> keys."""
-        code, said = self.run(self.new, 'lake', 'verify', *arguments)
-        assert code == (1 if said['findings'] else 0)
-        return {kind: [one['key'] for one in piled['first']] for kind, piled in said['findings'].items()}
+        code, report = self.run(self.new, 'lake', 'verify', *arguments)
+        assert code == (1 if report['findings'] else 0)
+        return {kind: [one['key'] for one in piled['first']] for kind, piled in report['findings'].items()}
 
     def replace(self, key: str, body: bytes, sha256: str) -> None:
         client(self.new).put_object(Bucket='sensor-data', Key=key, Body=body, Metadata={'sha256': sha256})

@@ -55,9 +55,9 @@ def test_systemd_is_notified_of_the_state(processes: Processes, seaweed: Tower, 
         assert systemd.recv(1000).decode().startswith('READY=1\nSTATUS=logging /talk to the S3 server')
         assert [systemd.recv(1000) for _ in range(2)] == [b'WATCHDOG=1'] * 2
         node.stop()
-        said = [systemd.recv(1000)]
-        while not said[-1].startswith(b'STOPPING=1'):
-            said.append(systemd.recv(1000))
+        reports = [systemd.recv(1000)]
+        while not reports[-1].startswith(b'STOPPING=1'):
+            reports.append(systemd.recv(1000))
 
 
 def test_the_next_start_delivers_the_rest(processes: Processes, seaweed: Tower, stored: Callable[..., Objects]) -> None:

@@ -54,8 +54,8 @@ class Robot:
 
     def synced(self) -> tuple[str, str]:
         """The result of one check of the registry, as from cron."""
-        told = self.verb('sync', '--json')
-        return told['done'], told['active']
+        report = self.verb('sync', '--json')
+        return report['done'], report['active']
 
 
 @pytest.fixture

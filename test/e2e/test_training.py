@@ -56,12 +56,12 @@ def test_a_model_is_found_by_what_it_was_trained_on(tmp_path: Path, tower: Tower
         return ran.stdout
 
     run(*MAIN, 'export', 'lerobot', 'patrols', '--mission-type', 'patrol')
-    told = run(str(PYTHON), str(ROOT / 'examples/train_navigation_policy.py'), '--export', 'patrols', '--epochs', '1')
+    text = run(str(PYTHON), str(ROOT / 'examples/train_navigation_policy.py'), '--export', 'patrols', '--epochs', '1')
     key = pq.read_table(tmp_path / 'patrols' / SOURCE_TABLE)['key'][0].as_py()
     found = json.loads(run(*MAIN, 'export', 'where', key, '--json'))
     assert [(each['where'], each['missions']) for each in found] == [(str(tmp_path / 'patrols'), ['m0'])]
     (trained,) = found[0]['runs']
-    assert f'run {trained} in navigation_policy_training' in told
+    assert f'run {trained} in navigation_policy_training' in text
     assert json.loads(run(*MAIN, 'export', 'where', 'thor/camera/20261028/none.tar', '--json')) == []
 
 

@@ -70,11 +70,11 @@ def test_both_times_of_each_object_are_stored(objects: Objects) -> None:
     """Keys and ``t_start_ns`` have the stamps, however wrong; the arrivals are stored next to them."""
     for name, skew_s in (('late', 146.0), ('ahead', -3600.0), ('fine', 0.0)):
         for key in objects.sensor(name):
-            said = objects.infos[key].metadata
+            report = objects.infos[key].metadata
             for begin in ('start', 'end'):
-                off_s = (int(said[f'received_{begin}_ns']) - int(said[f't_{begin}_ns'])) / SECOND
+                off_s = (int(report[f'received_{begin}_ns']) - int(report[f't_{begin}_ns'])) / SECOND
                 assert abs(off_s - skew_s) < 2.0, key
-            assert 'by_arrival' not in said
+            assert 'by_arrival' not in report
 
 
 @pytest.mark.long('publishers with clocks of their own')

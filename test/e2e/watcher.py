@@ -22,8 +22,8 @@ async def main(url: str, token: str) -> None:
                         sys.stdout.write(f'{head["figures"]["store"]["max_mbps"]}\n')
                         sys.stdout.flush()
                         await ws.send_json({'ping': 1})
-                if (said := frames.acknowledgement()) is not None:
-                    await ws.send_bytes(said)
+                if (report := frames.acknowledgement()) is not None:
+                    await ws.send_bytes(report)
 
 
 if __name__ == '__main__':

@@ -69,7 +69,7 @@ def test_idl_is_used_where_there_is_no_msg(tmp_path: Path, monkeypatch: pytest.M
 
 def test_the_type_hash_is_that_of_the_installed_definition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The hash is that of the type itself, from its .json; a broken or missing one is not a hash."""
-    told = {
+    fields = {
         'type_hashes': [
             {'type_name': 'zoo/msg/Other', 'hash_string': 'no'},
             {'type_name': 'zoo/msg/A', 'hash_string': 'RIHS01_1'},
@@ -77,7 +77,7 @@ def test_the_type_hash_is_that_of_the_installed_definition(tmp_path: Path, monke
     }
     files = {
         'zoo/A.msg': '',
-        'zoo/A.json': json.dumps(told),
+        'zoo/A.json': json.dumps(fields),
         'zoo/B.msg': '',
         'zoo/B.json': '{',
         'zoo/C.msg': '',

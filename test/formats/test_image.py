@@ -156,17 +156,17 @@ def test_an_image_too_large_for_jpeg_is_rejected(ros: Any) -> None:
 def test_a_jpeg_has_brightness_and_sharpness(ros: Any) -> None:
     """Computed from its gray: an even image has its brightness and no edges; a reader of the object computes the same."""
     board = np.kron(np.indices((6, 8)).sum(axis=0) % 2, np.ones((16, 16))) * 255
-    told = {}
+    fields = {}
     for name, gray in (('dark', np.full((96, 128), 20)), ('board', board)):
         picture = np.repeat(gray[:, :, None].astype(np.uint8), 3, axis=2)
         made = compressed(ros, bytes(simplejpeg.encode_jpeg(picture, quality=95))).object
-        told[name] = unpack_statistics(made.statistics)
-        assert told[name] == statistics_of(made.key, made.body)
-        assert (set(told[name]), told[name][ALL].count) == ({ALL, 'brightness', 'sharpness'}, 1)
-    assert told['dark']['brightness'].mean == pytest.approx(20, abs=2)
-    assert told['board']['brightness'].max == pytest.approx(127, abs=3)
-    assert told['dark']['sharpness'].max < 1
-    assert told['board']['sharpness'].max > 100
+        fields[name] = unpack_statistics(made.statistics)
+        assert fields[name] == statistics_of(made.key, made.body)
+        assert (set(fields[name]), fields[name][ALL].count) == ({ALL, 'brightness', 'sharpness'}, 1)
+    assert fields['dark']['brightness'].mean == pytest.approx(20, abs=2)
+    assert fields['board']['brightness'].max == pytest.approx(127, abs=3)
+    assert fields['dark']['sharpness'].max < 1
+    assert fields['board']['sharpness'].max > 100
     assert compressed(ros, jpeg(), statistics=('none',)).object.statistics == b''
 
 

@@ -295,11 +295,11 @@ def test_a_cloud_has_its_number_of_points_and_their_bounds(ros: Any) -> None:
     """Field by field, with the count of non-finite values; a reader of the object computes the same."""
     points = xyzi()
     made = ros.encode(CLOUD, cloud(ros, XYZI, points.tobytes(), width=5, point_step=16)).object
-    told = unpack_statistics(made.statistics)
-    assert told == statistics_of(made.key, made.body)
-    assert (set(told), told['points'].max) == ({ALL, 'points', 'x', 'y', 'z', 'intensity'}, 5)
-    assert (told['x'].min, told['x'].max, told['x'].count) == (points[:, 0].min(), points[:, 0].max(), 5)
-    assert (told['z'].first, told['z'].count, told['z'].nan_count) == (points[1, 2], 4, 1)
+    report = unpack_statistics(made.statistics)
+    assert report == statistics_of(made.key, made.body)
+    assert (set(report), report['points'].max) == ({ALL, 'points', 'x', 'y', 'z', 'intensity'}, 5)
+    assert (report['x'].min, report['x'].max, report['x'].count) == (points[:, 0].min(), points[:, 0].max(), 5)
+    assert (report['z'].first, report['z'].count, report['z'].nan_count) == (points[1, 2], 4, 1)
 
 
 @pytest.mark.parametrize('big', [False, True])

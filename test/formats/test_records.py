@@ -283,9 +283,9 @@ def test_infinities_of_a_scan_round_trip(ros: Any) -> None:
     batch = Batch('scan', '/scan', scan, tuple(Sample(STAMP_NS, cdr) for cdr in cdrs), 1000)
     body = encode(batch, SensorSettings(name='scan', topics=('scan',), batch_s=1.0), 'thor', ros.types).object.body
     assert isinstance(body, bytes)
-    told = json.loads(body, parse_constant=pytest.fail)
-    assert told['samples'][0]['ranges'] == [1.5, 'Infinity', '-Infinity', None, 0.1]
-    assert told['non_finite'] == 8
+    data = json.loads(body, parse_constant=pytest.fail)
+    assert data['samples'][0]['ranges'] == [1.5, 'Infinity', '-Infinity', None, 0.1]
+    assert data['non_finite'] == 8
     values = decode.table(decode.records(body), scan, ('ranges', 'range_max'), 0).values
     assert np.array_equal(values.astype(np.float32), np.array([[*ranges, math.inf]] * 2, np.float32), equal_nan=True)
     assert decode.table(decode.records(body), scan, (), 0).values.shape == (2, len(ranges) + 7)

@@ -28,8 +28,8 @@ def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str
 
 def lines(rows: Sequence[Mapping[str, Any]], kind: str = 'object', **changed: Any) -> bytes:
     """Row files of these rows, with some columns replaced: nothing is validated."""
-    told = [{'row': kind, **{name: value for name, value in {**row, **changed}.items() if value is not None}} for row in rows]
-    return compress(''.join(f'{json.dumps(each)}\n' for each in told).encode(), 3)
+    reports = [{'row': kind, **{name: value for name, value in {**row, **changed}.items() if value is not None}} for row in rows]
+    return compress(''.join(f'{json.dumps(each)}\n' for each in reports).encode(), 3)
 
 
 @cache

@@ -24,21 +24,21 @@ def make_pair(folder: Path, *, scale: float = 1.0, with_text: bool = True) -> Pa
              helper.make_node('Mul', ['flat', 'scale'], ['image_embeds'])]  # fmt: skip
     factor = numpy_helper.from_array(np.array(scale, np.float32), 'scale')
     _save(helper.make_graph(nodes, 'vision', [pixels], [embeds], [factor]), folder / 'onnx' / 'vision_model.onnx')
-    said = {
+    fields = {
         'do_resize': True,
         'size': {'shortest_edge': SIDE},
         'do_center_crop': True,
         'crop_size': {'height': SIDE, 'width': SIDE},
     }
-    said |= {'do_rescale': True, 'rescale_factor': 1 / 255, 'do_normalize': False}
-    (folder / 'preprocessor_config.json').write_text(json.dumps(said))
+    fields |= {'do_rescale': True, 'rescale_factor': 1 / 255, 'do_normalize': False}
+    (folder / 'preprocessor_config.json').write_text(json.dumps(fields))
     if with_text:
         ids = helper.make_tensor_value_info('input_ids', TensorProto.INT64, ['batch', 'length'])
-        told = helper.make_tensor_value_info('text_embeds', TensorProto.FLOAT, ['batch', 3])
+        report = helper.make_tensor_value_info('text_embeds', TensorProto.FLOAT, ['batch', 3])
         nodes = [helper.make_node('Gather', ['table', 'input_ids'], ['each']),
                  helper.make_node('ReduceMean', ['each'], ['text_embeds'], axes=[1], keepdims=0)]  # fmt: skip
         table = numpy_helper.from_array(COLOURS, 'table')
-        _save(helper.make_graph(nodes, 'text', [ids], [told], [table]), folder / 'onnx' / 'text_model.onnx')
+        _save(helper.make_graph(nodes, 'text', [ids], [report], [table]), folder / 'onnx' / 'text_model.onnx')
         tokenizer = Tokenizer(models.WordLevel(WORDS, unk_token='[UNK]'))
         tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
         tokenizer.save(str(folder / 'tokenizer.json'))

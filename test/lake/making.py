@@ -105,9 +105,11 @@ def fill(settings: StoreSettings, folder: Path, **which: Any) -> list[catalog.Ro
             add_part(store, rows, f'{utc(begin_ns):%Y%m%dT%H%M%S}_boot', folder)
             every += rows
         for mission, success in ((FAILED, False), (FINISHED, True)):
-            told = {'mission_id': mission, 'success': success, 'result': 'FINISHED' if success else 'FAILED', 'distance_m': 12.5,
-                    'mission_type': 'patrol', 'mission_command': 'go round', 'duration_s': 600}  # fmt: skip
-            add(store, folder, f'thor/missions/run-{mission}/summary.json', json.dumps(told).encode())
+            fields = {
+                'mission_id': mission, 'success': success, 'result': 'FINISHED' if success else 'FAILED', 'distance_m': 12.5,
+                'mission_type': 'patrol', 'mission_command': 'go round', 'duration_s': 600,
+            }  # fmt: skip
+            add(store, folder, f'thor/missions/run-{mission}/summary.json', json.dumps(fields).encode())
     return every
 
 

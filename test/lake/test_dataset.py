@@ -151,7 +151,7 @@ def test_repeats_are_separate_samples(tmp_path: Path) -> None:
     repeats = [
         {**one.metadata, 't_start_ns': str(at), 't_end_ns': str(at)} for at in (NOON_NS + 2 * SECOND, NOON_NS + 3 * SECOND)
     ]
-    still.catalogue([(one, told) for told in repeats])
+    still.catalogue([(one, report) for report in repeats])
     dataset = MissionDataset(Bucket(settings, BUCKET))
     assert [int(dataset[number]['stamp_ns']) for number in range(len(dataset))] == [
         *stamps, *(NOON_NS + second * SECOND for second in (1, 2, 3))
@@ -475,15 +475,15 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
 @pytest.fixture
 def in_worker(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The worker information from torch, with torch loaded."""
-    told = types.SimpleNamespace(id=0, num_workers=1)
+    report = types.SimpleNamespace(id=0, num_workers=1)
     module: Any = types.ModuleType('torch.utils.data')
-    module.get_worker_info = lambda: told
+    module.get_worker_info = lambda: report
     module.IterableDataset = type('IterableDataset', (), {'register': classmethod(lambda _, kind: kinds.append(kind))})
     kinds: list[type] = module.__dict__.setdefault('kinds', [])
     monkeypatch.setitem(sys.modules, 'torch.utils.data', module)
 
     def be(number: int, count: int) -> Any:
-        told.id, told.num_workers = number, count
+        report.id, report.num_workers = number, count
         return module
 
     return be

@@ -272,16 +272,16 @@ def test_unsynced_files_are_verified_after_a_power_cut(settings: StoreSettings, 
 
 def test_progress_adds_up(settings: StoreSettings, tmp_path: Path) -> None:
     """The reported bytes and objects, including existing ones, equal those requested."""
-    told = [0, 0]
+    reports = [0, 0]
 
     def tell(size: int, objects: int) -> None:
-        told[0] += size
-        told[1] += objects
+        reports[0] += size
+        reports[1] += objects
 
     for _ in range(2):
-        told[:] = [0, 0]
+        reports[:] = [0, 0]
         run(Asked(settings), tmp_path / 'data', tell=tell, threads=1)
-        assert told == [sum(map(len, OBJECTS.values())), COUNT]
+        assert reports == [sum(map(len, OBJECTS.values())), COUNT]
 
 
 @pytest.fixture(scope='module')
@@ -346,10 +346,10 @@ def filled(seaweed: Tower, tmp_path_factory: pytest.TempPathFactory) -> Tower:
     with closing(open_store(seaweed.store_settings(), UploadSettings())) as store:
         for number, key in enumerate(KEYS):
             stamp = str(NOON_NS + number * SECOND // 1000)
-            told = {'robot': ROBOT, 'sensor': 'camera', 't_start_ns': stamp, 't_end_ns': stamp}
-            add(store, folder, key, body(number), told)
-            said = {**told, 'sha256': SUMS[key]}
-            rows.append(catalog.row_of(catalog.BUCKET, key, len(body(number)), 'image/jpeg', said))
+            fields = {'robot': ROBOT, 'sensor': 'camera', 't_start_ns': stamp, 't_end_ns': stamp}
+            add(store, folder, key, body(number), fields)
+            values = {**fields, 'sha256': SUMS[key]}
+            rows.append(catalog.row_of(catalog.BUCKET, key, len(body(number)), 'image/jpeg', values))
         add_part(store, rows, 'part', folder)
     return seaweed
 
@@ -376,7 +376,7 @@ def left_over(to: Path) -> list[str]:
 @pytest.mark.seaweedfs
 def test_half_written_rows_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed at that moment they do not exist, and the next fetch removes the remains."""
-    said = catalog.row_of('sensor-data', f'{ROBOT}/camera/x.jpg', 1, 'image/jpeg', {'t_start_ns': str(NOON_NS)})
+    text = catalog.row_of('sensor-data', f'{ROBOT}/camera/x.jpg', 1, 'image/jpeg', {'t_start_ns': str(NOON_NS)})
 
     def die(_: object, __: object) -> None:
         raise SystemExit
@@ -384,7 +384,7 @@ def test_half_written_rows_are_ignored(tmp_path: Path, monkeypatch: pytest.Monke
     with monkeypatch.context() as patch:
         patch.setattr(os, 'replace', die)
         with pytest.raises(SystemExit):
-            keep_rows(tmp_path, [said])
+            keep_rows(tmp_path, [text])
     assert left_over(tmp_path)
     with Fetched(tmp_path):
         pass

@@ -72,8 +72,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for number, each in enumerate(THEIRS):
             add_part(store, [each], f'part{number}', root / 'tmp')
         for each in (*rows, *THEIRS):
-            told = {'sha256': str(each['sha256'])}
-            add(store, root / 'tmp', each['key'], content(each['sensor'], each['t_start_ns']), told)
+            fields = {'sha256': str(each['sha256'])}
+            add(store, root / 'tmp', each['key'], content(each['sensor'], each['t_start_ns']), fields)
     return root
 
 
@@ -120,13 +120,13 @@ def test_every_command_continues_without_it(home: Path, tmp_path: Path, kind: st
     key = bad_parts.put(folder_store(home), BAD[kind]())
     assert run(lake_command, home, 'ingest').return_value == 1, 'it names what it ingests now'
     verified = run(lake_command, home, 'verify', '--json')
-    told = json.loads(verified.stdout)
-    assert (verified.return_value, told['sound'], told['findings'], [one['key'] for one in told['left_out']]) == (
+    data = json.loads(verified.stdout)
+    assert (verified.return_value, data['sound'], data['findings'], [one['key'] for one in data['left_out']]) == (
         1, len(before), {}, [key],
     )  # fmt: skip
     fetched = run(fetch, home, '--since', '2026-10-28', '--to', str(tmp_path / 'data'), '--json')
-    told = json.loads(fetched.stdout)
-    assert (fetched.return_value, told['moved'], told['failed'], len(told['left_out'])) == (1, len(before), {}, 1)
+    data = json.loads(fetched.stdout)
+    assert (fetched.return_value, data['moved'], data['failed'], len(data['left_out'])) == (1, len(before), {}, 1)
     known = json.loads(run(lake_command, home, 'reindex', '--robot', 'thor', '--json').stdout)
     assert known['added'] == 2, 'the two summaries have no rows'
     before = good(home)

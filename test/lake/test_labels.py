@@ -79,8 +79,8 @@ def test_labels_choose_objects(lake: Bucket) -> None:
     assert query.objects(lake, label='nothing').to_pydict()['key'] == []
     both = [{'since_ns': NOON_NS + 10 * SECOND, 'until_ns': NOON_NS + MINUTE}]
     assert len(query.objects(lake, label='stairs', sensor='odom', ranges=both)) == 1
-    told = query.sql("SELECT label, width FROM labels WHERE label = 'person'", lake).to_pydict()
-    assert told == {'label': ['person'], 'width': [3.0]}
+    report = query.sql("SELECT label, width FROM labels WHERE label = 'person'", lake).to_pydict()
+    assert report == {'label': ['person'], 'width': [3.0]}
     rows = query.objects(lake, sensor='camera', since='2026-10-28T11:55', until='2026-10-28T12:01').sort_by('t_start_ns')
     column = labels.column(rows, labels.read(lake))
     assert [each for each in column if each] == [['person'], ['stairs'], ['stairs']]

@@ -49,10 +49,10 @@ class Lake:
             self.add(name, picture(colour), NOON_NS + place * SECOND + place % 2 * DAY_NS)
 
     def add(self, name: str, body: bytes, stamp_ns: int, sha256: str | None = None) -> None:
-        told = {**row('camera', stamp_ns), 'bytes': len(body), 'sha256': sha256 or hashlib.sha256(body).hexdigest()}
-        self.keys[name] = str(told['key'])
+        fields = {**row('camera', stamp_ns), 'bytes': len(body), 'sha256': sha256 or hashlib.sha256(body).hexdigest()}
+        self.keys[name] = str(fields['key'])
         add(self.store, self.home / 'tmp', self.keys[name], body)
-        add_part(self.store, [told], name.replace(' ', ''), self.home / 'tmp')
+        add_part(self.store, [fields], name.replace(' ', ''), self.home / 'tmp')
 
     def parts(self) -> list[str]:
         return [info.key for info in self.store.list('sensor-data', '_vectors/')]
@@ -150,13 +150,13 @@ def spoil(path: Path, fault: str) -> None:
     body = path.read_bytes()
     table = pq.read_table(io.BytesIO(body))
     digests, vectors = table['sha256'].to_pylist(), [np.frombuffer(each, '<f2') for each in table['vector'].to_pylist()]
-    said = dict(table.schema.metadata)
+    values = dict(table.schema.metadata)
     if fault == 'nan':
         vectors = [np.full_like(each, np.nan) for each in vectors]
     elif fault == 'half the numbers':
         vectors = [each[:1] * 0.5 for each in vectors]
     elif fault == 'of another model':
-        said[likeness.MODEL] = b'0' * 64
+        values[likeness.MODEL] = b'0' * 64
     elif fault == 'too many rows':
         digests, vectors = digests * 5000, [vectors[0]] * len(vectors) * 5000
     width = 2 * len(vectors[0])
@@ -167,7 +167,7 @@ def spoil(path: Path, fault: str) -> None:
     columns = [pa.array(digests, pa.binary(32)), pa.array([each.astype('<f2').tobytes() for each in vectors], pa.binary(width))]
     out = io.BytesIO()
     many = fault == 'too many rows'
-    pq.write_table(pa.table(columns, schema=pa.schema(fields, metadata=said)), out, compression='zstd' if many else 'none',
+    pq.write_table(pa.table(columns, schema=pa.schema(fields, metadata=values)), out, compression='zstd' if many else 'none',
                    use_dictionary=many)  # fmt: skip
     path.write_bytes({'truncated': body[:-9], 'noise': b'PAR1' + bytes(200) + b'PAR1'}.get(fault, out.getvalue()))
 

@@ -105,9 +105,9 @@ def _add_bag(settings: StoreSettings, folder: Path, name: str, begin_ns: int, *,
         bodies[f'{prefix}manifest.json'] = manifest.to_json(), begin_ns
     with closing(open_store(settings, UploadSettings())) as store:
         for number, (key, (body, at_ns)) in enumerate(bodies.items()):
-            said = {'robot': 'thor', 'sensor': 'bag', 't_start_ns': str(at_ns), 't_end_ns': str(at_ns + SECOND)}
-            add(store, folder, key, body, said)
-            add_part(store, [catalog.row_of(catalog.BUCKET, key, len(body), '', said)], f'{name}{number}', folder)
+            fields = {'robot': 'thor', 'sensor': 'bag', 't_start_ns': str(at_ns), 't_end_ns': str(at_ns + SECOND)}
+            add(store, folder, key, body, fields)
+            add_part(store, [catalog.row_of(catalog.BUCKET, key, len(body), '', fields)], f'{name}{number}', folder)
     return sorted(bodies)
 
 
@@ -178,9 +178,9 @@ def test_the_gap_journal_lists_deletions(settings: StoreSettings, tmp_path: Path
     """For each hour one gap with its messages, which a later prune of more of that hour replaces."""
     began_ns = NOW_NS - 9 * DAY_NS
     with closing(open_store(settings, UploadSettings())) as store:
-        said = complete('thor', 'j', 1, sink='objects', topic='/camera/compressed', session=1, from_ns=began_ns,
+        report = complete('thor', 'j', 1, sink='objects', topic='/camera/compressed', session=1, from_ns=began_ns,
                         to_ns=NOW_NS, grade='exact', received=60, skipped=0)  # fmt: skip
-        body = encode([said], gaps.GAPS)
+        body = encode([report], gaps.GAPS)
         add(store, tmp_path / 'tmp', gaps.GAPS.part_key('thor', f'{utc(NOW_NS):%Y-%m-%d}', 'mark'), body, {'robot': 'thor'})
     first = row('camera', began_ns)
     _run(settings, exported={(first['bucket'], first['key']): 'a set'})
@@ -291,10 +291,10 @@ def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp
     old_ns = NOW_NS - 9 * DAY_NS
     forged = {**row('camera', old_ns + MINUTE_NS), 'key': young['key']}
     known = {name: young[name] for name in ('bucket', 'key', 'bytes', 't_start_ns')}
-    said = {**dict.fromkeys(catalog.FORGOTTEN.columns), **known, 'forgotten_ns': NOW_NS, 'format_version': 1}  # fmt: skip
+    fields = {**dict.fromkeys(catalog.FORGOTTEN.columns), **known, 'forgotten_ns': NOW_NS, 'format_version': 1}  # fmt: skip
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [forged], 'forged', tmp_path / 'tmp')
-        body = encode([said], catalog.FORGOTTEN)
+        body = encode([fields], catalog.FORGOTTEN)
         add(store, tmp_path / 'tmp', f'thor/_forgotten/date={utc(NOW_NS):%Y-%m-%d}/thor_x.jsonl.zst', body, {'robot': 'thor'})
     assert _run(settings).objects == 12
     assert young['key'] in _stored(settings)
@@ -455,10 +455,10 @@ def command(tower: Tower, *arguments: str, url: str = '') -> subprocess.Popen[st
 
 def ended(processes: Sequence[subprocess.Popen[str]]) -> list[str]:
     """The output of each, after all have succeeded."""
-    said = [process.communicate(timeout=240) for process in processes]
-    for process, (out, err) in zip(processes, said, strict=True):
+    reports = [process.communicate(timeout=240) for process in processes]
+    for process, (out, err) in zip(processes, reports, strict=True):
         assert process.returncode == 0, f'{process.args}: {out}{err}'
-    return [out for out, _ in said]
+    return [out for out, _ in reports]
 
 
 @pytest.mark.seaweedfs
@@ -502,8 +502,8 @@ def test_prune_may_be_killed_next_to_readers_and_a_compaction(seaweed: Tower, tm
     assert fetched.keys() >= young
     for key in young:
         assert fetched[key].read_bytes() == content(rows[key]['sensor'], rows[key]['t_start_ns'])
-    told = Counter(each['key'] for each in forgotten(source, ROBOT, Findings()).to_pylist())
-    assert told == Counter(dict.fromkeys(going, 1))
+    report = Counter(each['key'] for each in forgotten(source, ROBOT, Findings()).to_pylist())
+    assert report == Counter(dict.fromkeys(going, 1))
     (asked,) = ended([command(seaweed, 'query', '--robot', ROBOT, '--since', '20d', '--json')])
     answer: list[dict[str, Any]] = json.loads(asked)
     assert {each['key'] for each in answer} == there()

@@ -130,8 +130,8 @@ def test_a_pull_delivers_the_requested_objects(field: Field) -> None:
     field.records(*range(6))
     assert field.kept() == [0, 1, 2, 3, 4, 5]
     assert run('query', '--sensor', 'camera') == []
-    said = run('pull', '--sensor', 'camera', '--near', '3,0,1', '--user', 'ada')
-    assert (said['robot'], said['objects'], said['bytes'], said['answer']) == ('thor', 3, 3000, None)
+    report = run('pull', '--sensor', 'camera', '--near', '3,0,1', '--user', 'ada')
+    assert (report['robot'], report['objects'], report['bytes'], report['answer']) == ('thor', 3, 3000, None)
     assert [one['state'] for one in run('pull', '--list')] == ['asked']
     field.passes()
     assert [(one['state'], one['by']) for one in run('pull', '--list')] == [('done', 'ada')]
@@ -173,10 +173,10 @@ def test_objects_lost_on_the_robot_are_reported(field: Field) -> None:
     """The row of a loss supersedes that of the kept object, before and after a merge, and so does that of an arrival."""
     field.records(*range(8), size=200 << 10)
     assert field.kept() == [3, 4, 5, 6, 7]
-    said = run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:04Z')
-    assert (said['objects'], said['lost']) == (1, {'no_room': 3})
+    report = run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:04Z')
+    assert (report['objects'], report['lost']) == (1, {'no_room': 3})
     field.passes()
-    answer = lake.newest_answer(field.source, 'thor', said['id'])
+    answer = lake.newest_answer(field.source, 'thor', report['id'])
     assert answer
     assert (answer.gone['objects'], answer.gone['reasons']) == (3, {'evicted: no_room': 3})
     assert field.kept() == [4, 5, 6, 7]
@@ -277,11 +277,11 @@ def test_throughput_predicts_the_duration_of_a_pull(field: Field, tmp_path: Path
     field.now_s += 60
     field.passes()
     monkeypatch.setattr(link.time, 'time_ns', lambda: NOON_NS + 3600 * SECOND)
-    said = run('pull', '--sensor', 'camera', '--dry-run')
-    assert (said['mbps'], said['seconds']) == (2.0, pytest.approx(0.008))
+    report = run('pull', '--sensor', 'camera', '--dry-run')
+    assert (report['mbps'], report['seconds']) == (2.0, pytest.approx(0.008))
     target = tmp_path / 'wifi.png'
-    told = run('lake', 'coverage', '--since', '2025-10-18', '--until', '2025-10-19', '--wifi', str(target))
-    assert [one['mbps'] for one in told] == [0.0, 1.0, 2.0, 9.0]
+    text = run('lake', 'coverage', '--since', '2025-10-18', '--until', '2025-10-19', '--wifi', str(target))
+    assert [one['mbps'] for one in text] == [0.0, 1.0, 2.0, 9.0]
     assert target.read_bytes().startswith(b'\x89PNG')
 
 
@@ -329,22 +329,22 @@ def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:
     body = json.dumps({'format': 1, 'entries': junk}).encode()
     assert field.store.replace('sensor-data', prefix, body, found[1])
     assert [one['by'] for one in run('pull', '--list')] == ['x']
-    said = run('pull', '--sensor', 'camera')
-    assert [one['id'] for one in run('pull', '--list')] == [said['id']] == [ours['id']]
+    report = run('pull', '--sensor', 'camera')
+    assert [one['id'] for one in run('pull', '--list')] == [report['id']] == [ours['id']]
     for number, answer in enumerate((
         {'state': 'sending', 'objects': '\x1b[2J', 'outcomes': {'delivered': [1]}, 'number': {}},
         {'state': 'done\x07', 'objects': 10**30, 'outcomes': {'x': 1}, 'bags': {}, 'made_ns': 'x'},
         {'state': 'sending', 'outcomes': [], 'bags': [['x']], 'why': {'a': 1}, 'time': []},
         {'state': 'done\x07', 'objects': 10**30, 'outcomes': {'\x1b': {}}, 'bags': ['\x1b[2J'], 'why': '\x07', 'time': '\x1b'},
     ), 50):  # fmt: skip
-        place = field.settings.directory / 'sensor-data' / 'thor' / '_answers' / said['id'] / f'{number}.json'
+        place = field.settings.directory / 'sensor-data' / 'thor' / '_answers' / report['id'] / f'{number}.json'
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text(json.dumps({'id': said['id'], **answer}))
+        place.write_text(json.dumps({'id': report['id'], **answer}))
         done = CliRunner().invoke(cli, ['pull', '--list'], standalone_mode=False)
         assert done.exception is None
         assert '\x1b' not in done.output
         assert '\x07' not in done.output
-    newest = lake.newest_answer(field.source, 'thor', said['id'])
+    newest = lake.newest_answer(field.source, 'thor', report['id'])
     assert newest
     assert newest.state == 'done\x07'
     assert '\x1b' not in visible(_sentence(newest))

@@ -105,8 +105,8 @@ def test_an_invalid_place_is_refused(world: tuple[StoreSettings, list[catalog.Ro
 def test_by_received_selects_by_arrival_time(tmp_path: Path) -> None:
     """A frame that arrived on the next day is of that day by arrival, and of the day of its stamp otherwise."""
     settings, late_ns = folder_store(tmp_path), 13 * 3600 * 10**9
-    told = {'received_start_ns': str(NOON_NS + late_ns), 'received_end_ns': str(NOON_NS + late_ns)}
-    rows = [row('camera', NOON_NS, **told), row('odom', NOON_NS)]
+    fields = {'received_start_ns': str(NOON_NS + late_ns), 'received_end_ns': str(NOON_NS + late_ns)}
+    rows = [row('camera', NOON_NS, **fields), row('odom', NOON_NS)]
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, rows, '20261028T120000_boot', tmp_path / 'tmp')
     source, next_day = Bucket(settings, catalog.BUCKET), {'since': '2026-10-29', 'until': '2026-10-30'}
@@ -207,10 +207,10 @@ def test_a_mission_without_a_summary_has_no_end(tmp_path: Path) -> None:
     source.delete(f'thor/missions/run-{FAILED}/summary.json')
     store = open_store(settings, UploadSettings())
     add(store, tmp_path / 'tmp', 'thor/missions/run-x/summary.json', b'{broken')
-    told = lake.missions(source).sort_by('mission_id').to_pydict()
-    assert told['mission_id'] == [FAILED, FINISHED]
-    assert told['success'] == [None, True]
-    assert told['duration_s'] == [None, 600.0]
+    report = lake.missions(source).sort_by('mission_id').to_pydict()
+    assert report['mission_id'] == [FAILED, FINISHED]
+    assert report['success'] == [None, True]
+    assert report['duration_s'] == [None, 600.0]
     assert found(source, success=False) == []
 
 
@@ -222,10 +222,10 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
     source = Bucket(settings, catalog.BUCKET)
     for mission, policy in ((FAILED, manifest.id), (FINISHED, f'{manifest.name}@7#{16 * "0"}')):
         key = f'thor/missions/run-{mission}/summary.json'
-        told = json.loads(source.get(key, 1 << 20)) | {'policy': policy}
+        fields = json.loads(source.get(key, 1 << 20)) | {'policy': policy}
         source.delete(key)
         with closing(open_store(settings, UploadSettings())) as store:
-            add(store, tmp_path / 'tmp', key, json.dumps(told).encode())
+            add(store, tmp_path / 'tmp', key, json.dumps(fields).encode())
     shutil.copytree(packed, settings.directory / 'lerobot' / 'policies' / 'go2' / 'go2_patrol_v7')
     failed = lake.sql('SELECT policy, policy_dataset FROM missions WHERE NOT success', source).to_pylist()
     assert failed == [{'policy': manifest.id, 'policy_dataset': 64 * 'd'}]
@@ -236,9 +236,9 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
         assert found(source, policy=wanted) == expected, wanted
     assert found(source, policy='go2_patrol', success=False) == own
     others = 'go2_patrol@7#0000000000000000, none, go2_stairs@3#1111111111111111'
-    told = {'policy': 'go2_patrol@7#0000000000000000', 'policies': others}  # it changed during the mission
+    fields = {'policy': 'go2_patrol@7#0000000000000000', 'policies': others}  # it changed during the mission
     with closing(open_store(settings, UploadSettings())) as store:
-        add(store, tmp_path / 'tmp', 'thor/missions/run-both/summary.json', json.dumps(told).encode())
+        add(store, tmp_path / 'tmp', 'thor/missions/run-both/summary.json', json.dumps(fields).encode())
         both = {**row('camera', NOON_NS + 10**9), 'mission_id': 'mlast', 'run_id': 'run-both'}
         add_part(store, [both], 'both', tmp_path / 'tmp')
     assert lake.missions(source).sort_by('mission_id').to_pydict()['policies'] == [None, None, others]
@@ -260,8 +260,8 @@ def test_objects_delivered_before_their_run_existed_belong_to_the_mission(tmp_pa
     frames = sorted(each['key'] for each in rows if each['sensor'] == 'camera' and each['mission_id'] == FAILED)
     assert found(source, sensor='camera', success=False) == frames
     assert found(source, sensor='camera', mission='run-mfail', **DAY) == found(source, sensor='camera', mission=FAILED) == frames
-    told = lake.missions(source, sensor='camera', **DAY).sort_by('mission_id').to_pydict()
-    assert (told['run_id'], told['success']) == ([f'run-{FAILED}', f'run-{FINISHED}'], [False, True])
+    report = lake.missions(source, sensor='camera', **DAY).sort_by('mission_id').to_pydict()
+    assert (report['run_id'], report['success']) == ([f'run-{FAILED}', f'run-{FINISHED}'], [False, True])
 
 
 @pytest.mark.parametrize(

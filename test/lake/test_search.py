@@ -37,11 +37,11 @@ def lake(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
     with closing(open_store(settings, UploadSettings())) as store:
         for number, (kind, command, success, events, errors) in enumerate(MISSIONS):
             begin_ns = NOON_NS + number * HOUR
-            told = {'mission_id': f'm{number}', 'mission_type': kind, 'mission_command': command, 'success': success,
+            fields = {'mission_id': f'm{number}', 'mission_type': kind, 'mission_command': command, 'success': success,
                     'start_ns': begin_ns, 'end_ns': begin_ns + 60 * SECOND, 'result': 'FINISHED' if success else 'FAILED',
                     'events': [{'time': '2026-10-28T12:00:05Z', **event} for event in events],
                     'errors': [{'error': text} for text in errors]}  # fmt: skip
-            add(store, root, f'thor/missions/run{number}/summary.json', json.dumps(told).encode())
+            add(store, root, f'thor/missions/run{number}/summary.json', json.dumps(fields).encode())
         add(store, root, 'thor/missions/run3/camera/frame_000001.jpg', b'one that goes on')
         add(store, root, 'thor/missions/run4/summary.json', b'{"not": json')
         label = labels.Label(robot='thor', label='stairs', since_ns=NOON_NS + 2 * HOUR, until_ns=NOON_NS + 2 * HOUR + SECOND)
@@ -199,8 +199,8 @@ def test_labels_of_scripts_without_spaces_are_compared_whole(tmp_path: Path) -> 
     """The flag compares complete names, and names are returned unchanged."""
     settings = folder_store(tmp_path)
     with closing(open_store(settings, UploadSettings())) as store:
-        told = {'mission_id': 'm', 'mission_command': '厨房', 'start_ns': NOON_NS, 'end_ns': NOON_NS + SECOND}
-        add(store, tmp_path / 'x', 'thor/missions/run/summary.json', json.dumps(told).encode())
+        fields = {'mission_id': 'm', 'mission_command': '厨房', 'start_ns': NOON_NS, 'end_ns': NOON_NS + SECOND}
+        add(store, tmp_path / 'x', 'thor/missions/run/summary.json', json.dumps(fields).encode())
         labels.write(store, 'thor', [labels.Label(robot='thor', label='楼梯', since_ns=NOON_NS, until_ns=NOON_NS + 1)], by='ann')
     path = tmp_path / 'search.db'
     search.update(path, Bucket(settings, 'sensor-data'))

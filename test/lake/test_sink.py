@@ -143,8 +143,8 @@ def test_the_newest_statement_stays(url: str, settings: StoreSettings, tmp_path:
     newer = send(url, settings, tmp_path)
     assert newer.added >= 2
     ask(url, 'robots-*/_refresh', 'POST')
-    said = Counter(hit['_source']['what'] for hit in ask(url, 'robots-gaps/_search')['hits']['hits'])
-    assert said == {'withdrawn': 2, 'complete': 1}
+    report = Counter(hit['_source']['what'] for hit in ask(url, 'robots-gaps/_search')['hits']['hits'])
+    assert report == {'withdrawn': 2, 'complete': 1}
     (label,) = ask(url, 'robots-labels/_search')['hits']['hits']
     assert (label['_source']['what'], label['_source']['label']) == ('removed', 'stairs')
 
@@ -175,17 +175,17 @@ def test_pruned_objects_are_marked(url: str, settings: StoreSettings, tmp_path: 
     """Its document keeps all fields, whenever the deletion is sent, and exists once."""
     with closing(open_store(settings, UploadSettings())) as store:
         row = fill_row()
-        told = {name: row[name] for name in catalog.FORGOTTEN.columns if name in row}
-        told |= {'rule': 'camera 90d', 'forgotten': NOON_NS // 1000, 'forgotten_ns': NOON_NS}
+        fields = {name: row[name] for name in catalog.FORGOTTEN.columns if name in row}
+        fields |= {'rule': 'camera 90d', 'forgotten': NOON_NS // 1000, 'forgotten_ns': NOON_NS}
         key = catalog.FORGOTTEN.part_key('thor', catalog.date_of(row), 'x')
-        add(store, tmp_path, key, parts.encode([told], catalog.FORGOTTEN))
+        add(store, tmp_path, key, parts.encode([fields], catalog.FORGOTTEN))
     send(url, settings, tmp_path)
     assert send(url, settings, tmp_path).added == 0
     assert counts(url) == COUNTS
     (hit,) = ask(url, 'robots-objects/_search?q=rule:camera*')['hits']['hits']
-    said = hit['_source']
-    assert (said['key'], said['forgotten']) == (row['key'], '2026-10-28T12:00:00.000000000Z')
-    assert (said['sha256'], said['position']['x']) == (row['sha256'], row['x'])
+    report = hit['_source']
+    assert (report['key'], report['forgotten']) == (row['key'], '2026-10-28T12:00:00.000000000Z')
+    assert (report['sha256'], report['position']['x']) == (row['sha256'], row['x'])
 
 
 def fill_row() -> catalog.Row:
@@ -375,10 +375,10 @@ def test_the_user_agent_names_this_package(url: str, settings: StoreSettings, tm
     with pytest.raises(SettingError, match='URL') as refused:
         sink.SearchServer('http://me:secret@127.0.0.1:9200')
     assert 'secret' not in str(refused.value)
-    said = sink.authorization({'ELASTIC_USERNAME': 'me', 'ELASTIC_PASSWORD': 'secret'})
-    server = sink.SearchServer(url, said)
+    report = sink.authorization({'ELASTIC_USERNAME': 'me', 'ELASTIC_PASSWORD': 'secret'})
+    server = sink.SearchServer(url, report)
     assert 'secret' not in repr(server)
-    assert said not in repr(server)
+    assert report not in repr(server)
     server.close()
     assert sink.authorization({'ELASTIC_API_KEY': 'abc'}) == 'ApiKey abc'
     assert sink.authorization({}) == ''
@@ -467,11 +467,11 @@ def test_a_killed_run_resumes(url: str, settings: StoreSettings, tmp_path: Path)
         command = [sys.executable, '-c', RUN, 'lake', 'sink', proxy, '--json']
         for _ in range(10):
             running.append(subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL))
-            said, _ = running[-1].communicate(timeout=120)
+            report, _ = running[-1].communicate(timeout=120)
             if running[-1].returncode == 0:
                 break
         assert len(running) >= 3
-        assert json.loads(said)['refused'] == {}
+        assert json.loads(report)['refused'] == {}
         for headers, body in seen:
             documented(headers, body)
     moved = StoreSettings(directory=home / 'store')

@@ -128,12 +128,12 @@ def met(text: str, messages: list[dict[str, Any]]) -> list[bool]:
     holds = False
     for each in fields(messages, path).values():
         finite = [value for value in each if value is not None]
-        told: dict[str, Any] = {'count': len(finite), 'nan_count': len(each) - len(finite)}
+        values: dict[str, Any] = {'count': len(finite), 'nan_count': len(each) - len(finite)}
         if finite:
-            told |= {'min': min(finite), 'max': max(finite), 'first': finite[0], 'last': finite[-1]}
+            values |= {'min': min(finite), 'max': max(finite), 'first': finite[0], 'last': finite[-1]}
             with suppress(OverflowError):
-                told['mean'] = math.fsum(finite) / len(finite)
-        holds |= function in told and SIGNS[sign](told[function], float(number))
+                values['mean'] = math.fsum(finite) / len(finite)
+        holds |= function in values and SIGNS[sign](values[function], float(number))
     return [holds] * len(messages)
 
 
@@ -167,10 +167,10 @@ def test_the_answer_is_what_a_loop_over_all_messages_finds(
     folder: Path, batches: list[list[dict[str, Any]]], conditions: list[str], data: st.DataObject
 ) -> None:
     """With statistics of all objects, of some, or of selected fields; before files of tables are merged and after it."""
-    told = data.draw(st.lists(st.booleans(), min_size=len(batches), max_size=len(batches)))
+    report = data.draw(st.lists(st.booleans(), min_size=len(batches), max_size=len(batches)))
     examples[0] += 1
     root = folder / str(examples[0])
-    source = filled(root, batches, told, data.draw(st.sampled_from([(), ('a', 'n')])))
+    source = filled(root, batches, report, data.draw(st.sampled_from([(), ('a', 'n')])))
     if data.draw(st.booleans()):
         merge(source.settings)
     seen = [[json.loads(orjson.dumps(message)) for message in messages] for messages in batches]

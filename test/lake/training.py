@@ -98,8 +98,8 @@ class Drive:
                             (('received_start_ns', one.t_start_ns), ('received_end_ns', one.t_end_ns))}  # fmt: skip
                 metadata = {**(received if self.has_arrivals else {}), **metadata}
                 add(store, self._folder, one.key, body, metadata, content_type=one.content_type)
-                told = {**metadata, 'sha256': hashlib.sha256(body).hexdigest()}
-                rows.append(catalog.row_of(one.bucket, one.key, len(body), one.content_type, told))
+                fields = {**metadata, 'sha256': hashlib.sha256(body).hexdigest()}
+                rows.append(catalog.row_of(one.bucket, one.key, len(body), one.content_type, fields))
             add_part(store, rows, f'part{len(self.rows)}', self._folder)
         self.rows += rows
 
@@ -148,16 +148,16 @@ class Drive:
         return bytes(self._ros.cdr(ODOMETRY, pose={'pose': {'position': {'x': float(second)}}}))
 
     def _imu(self, stamp_ns: int) -> bytes:
-        told = np.array(imu_reading(stamp_ns), np.float32)
-        return bytes(self._ros.cdr(IMU, gyroscope=told[:3], accelerometer=told[3:6], quaternion=told[6:]))
+        report = np.array(imu_reading(stamp_ns), np.float32)
+        return bytes(self._ros.cdr(IMU, gyroscope=report[:3], accelerometer=report[3:6], quaternion=report[6:]))
 
     def _cloud(self, second: int) -> bytes:
         points = np.arange(4 * (second + 2), dtype='<f4').reshape(-1, 4)
         names = ('x', 'y', 'z', 'intensity')
         fields = [self._ros.make('sensor_msgs/msg/PointField', name=name, offset=4 * place, datatype=7, count=1)
                   for place, name in enumerate(names)]  # fmt: skip
-        told = {'height': 1, 'width': len(points), 'point_step': 16, 'row_step': 16 * len(points), 'fields': fields}
-        return bytes(self._ros.cdr(CLOUD, **told, data=points.view(np.uint8).reshape(-1)))
+        values = {'height': 1, 'width': len(points), 'point_step': 16, 'row_step': 16 * len(points), 'fields': fields}
+        return bytes(self._ros.cdr(CLOUD, **values, data=points.view(np.uint8).reshape(-1)))
 
 
 def in_a_child(frames: MissionDataset, numbers: Sequence[int], out: Any) -> None:

@@ -250,8 +250,8 @@ def test_the_page_of_a_robot_detects_its_conditions(tmp_path: Path) -> None:
         'free_bytes': 5, 'min_free_bytes': 2, 'bytes': 8, 'max_bytes': 10, 'quarantined': 0}}  # fmt: skip
 
     def is_on(**spool: Any) -> dict[str, bool | None]:
-        told = {**figures, 'spool': {**figures['spool'], **spool}}
-        return {each.name: each.is_on for each in conditions_of_robot(told, 0, tmp_path / 'policies', settings)}
+        fields = {**figures, 'spool': {**figures['spool'], **spool}}
+        return {each.name: each.is_on for each in conditions_of_robot(fields, 0, tmp_path / 'policies', settings)}
 
     fine = dict.fromkeys(('silent', 'losses', 'disk', 'quarantine'), False)
     assert is_on() == fine

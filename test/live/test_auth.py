@@ -298,8 +298,8 @@ def test_a_sign_in_replaces_the_previous_cookie(bind: str, tmp_path: Path, monke
 
     async def role(page: Page, who: str) -> str:
         status, _, body = await page.ask(who, 'GET', '/api/session')
-        told = json.loads(body)
-        return told['role'] if status == 200 and told['signed_in'] else ''
+        data = json.loads(body)
+        return data['role'] if status == 200 and data['signed_in'] else ''
 
     async def run() -> None:
         async with (
@@ -329,8 +329,8 @@ def test_a_sign_in_replaces_the_previous_cookie(bind: str, tmp_path: Path, monke
             others |= {'gone': page.cookies['viewer'], 'new': page.cookies['new']}
         async with serving(tmp_path, monkeypatch, bind) as page:
             page.cookies = others
-            told = [await role(page, who) for who in ('viewer', 'operator', 'new', 'gone')]
-            assert told == ['viewer', 'operator', 'operator', '']
+            data = [await role(page, who) for who in ('viewer', 'operator', 'new', 'gone')]
+            assert data == ['viewer', 'operator', 'operator', '']
 
     asyncio.run(run())
 

@@ -54,9 +54,9 @@ def robots(home: Path) -> Path:
 def test_robots_that_need_attention_come_first(robots: Path) -> None:
     """Those with losses today first, then healthy ones, then those offline; of a long-silent robot the last day is known."""
     found = overview(Bucket(folder_store(robots), 'sensor-data'), Findings(lambda _: None), NOON_NS + 60 * SECOND)
-    told = [(one.robot, one.state(NOON_NS + 60 * SECOND)[0], sum(one.lost.values())) for one in found]
-    assert told[0] == ('thor', WATCH, 7)
-    assert [state for _, state, _ in told[2:]] == [SILENT, SILENT]
+    reports = [(one.robot, one.state(NOON_NS + 60 * SECOND)[0], sum(one.lost.values())) for one in found]
+    assert reports[0] == ('thor', WATCH, 7)
+    assert [state for _, state, _ in reports[2:]] == [SILENT, SILENT]
     by_name = {one.robot: one for one in found}
     assert list(by_name) == ['thor', 'loki', 'odin', 'freya']
     assert by_name['thor'].known_ns == NOON_NS + 8 * SECOND

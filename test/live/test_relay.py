@@ -72,8 +72,8 @@ class Browser:
             async for message in ws:
                 for head, body in frames.take(message.data):
                     self.newest[head['topic'] or head['kind']] = head, body
-                if (said := frames.acknowledgement()) is not None:
-                    await ws.send_bytes(said)
+                if (report := frames.acknowledgement()) is not None:
+                    await ws.send_bytes(report)
 
 
 async def until(condition: Callable[[], Any]) -> None:
@@ -157,8 +157,8 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
                 task = asyncio.create_task(browser.run(page))
 
                 def problem() -> str | None:
-                    told: str | None = browser.newest.get('topics', ({'problem': None},))[0]['problem']
-                    return told
+                    report: str | None = browser.newest.get('topics', ({'problem': None},))[0]['problem']
+                    return report
 
                 await until(lambda: problem() == '' and robot.server.viewers.connected)
                 make_tokens(robot.folder, replace=True)
@@ -246,7 +246,7 @@ def test_a_robot_that_ends_each_connection_is_asked_again_after_a_pause(tmp_path
 def test_a_viewer_during_disconnect_sees_the_robot_immediately() -> None:
     """As after a reload of Tower's page: the robot's reply to closing an unused connection is not an error."""
     came: list[float] = []
-    told: list[Any] = []
+    reports: list[Any] = []
 
     async def watch(request: web.Request) -> web.StreamResponse:
         came.append(asyncio.get_running_loop().time())
@@ -261,7 +261,7 @@ def test_a_viewer_during_disconnect_sees_the_robot_immediately() -> None:
     async def run() -> None:
         async with answering(web.get('/ws', watch)) as address:
             wanted: list[list[str] | None] = [[]]
-            one = relay.Relay(address, None, lambda: wanted[0], lambda item: told.append((item.head or {}).get('problem')))
+            one = relay.Relay(address, None, lambda: wanted[0], lambda item: reports.append((item.head or {}).get('problem')))
             one.open()
             try:
                 await until(lambda: came)
@@ -272,7 +272,7 @@ def test_a_viewer_during_disconnect_sees_the_robot_immediately() -> None:
                 wanted[0] = []
                 one.wake()
                 await until(lambda: len(came) > 1)
-                assert [problem for problem in told if problem] == []
+                assert [problem for problem in reports if problem] == []
             finally:
                 await one.close()
 

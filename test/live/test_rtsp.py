@@ -84,9 +84,9 @@ def test_a_missing_gstreamer_has_a_remedy(monkeypatch: pytest.MonkeyPatch, tmp_p
         monkeypatch.setattr(module, 'PYTHON', python)
         if python is bare:
             bare.chmod(0o755)
-        said = asyncio.run(run())
-        assert 'gir1.2-gst-rtsp-server-1.0' in said
-        assert 'secret' not in said
+        report = asyncio.run(run())
+        assert 'gir1.2-gst-rtsp-server-1.0' in report
+        assert 'secret' not in report
 
 
 def hashed(text: str) -> str:
@@ -209,17 +209,17 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         pipe = asyncio.subprocess.PIPE
         command += [f'location={out}/%03d.jpg', 'max-files=5']
         player = await asyncio.create_subprocess_exec(*command, stdout=pipe, stderr=pipe)
-        said = asyncio.create_task(player.communicate())
+        report = asyncio.create_task(player.communicate())
 
         async def has_enough() -> bool:
-            return said.done() or len(list(out.iterdir())) >= 4
+            return report.done() or len(list(out.iterdir())) >= 4
 
         try:
             await until(has_enough, 'frames')
         finally:
             if player.returncode is None:
                 player.terminate()
-        return b''.join(await said).decode()
+        return b''.join(await report).decode()
 
     async def run() -> None:
         async with robot(tmp_path, monkeypatch, rtsp=0) as found:
@@ -237,9 +237,9 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             assert list((tmp_path / 'none').iterdir()) == []
             assert await is_idle()
             assert {*players} <= {()}
-            said = await play(url, password, tmp_path / 'out')
+            report = await play(url, password, tmp_path / 'out')
             pictures = [path.read_bytes() for path in sorted((tmp_path / 'out').iterdir())[:3]]
-            assert len(pictures) == 3, said
+            assert len(pictures) == 3, report
             for played in pictures:
                 level = int(simplejpeg.decode_jpeg(played)[120, 160, 1])
                 assert min(abs(level - (20 + 18 * number)) for number in range(LEVELS)) < 4

@@ -45,8 +45,8 @@ async def watched(server: LiveServer, items: list[LiveItem]) -> list[tuple[str, 
                     server.viewers.on_items(items)
                 elif head['topic']:
                     found.append((head['topic'], head['number'], body))
-            if (said := frames.acknowledgement()) is not None:
-                await ws.send_bytes(said)
+            if (report := frames.acknowledgement()) is not None:
+                await ws.send_bytes(report)
             if len(found) == len(items):
                 await ws.close()
     return found
@@ -73,8 +73,8 @@ def test_items_of_every_size_arrive_complete(tmp_path: Path, monkeypatch: pytest
 def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not that of the page's environment variables: the home of its spool, and its robot."""
     doctor = tmp_path / 'doctor'
-    said = """'{"asked": "%s", "home": "%s", "robot": "%s"}' "$*" "$SHADOWHOUND_HOME" "$SHADOWHOUND_ROBOT\""""
-    doctor.write_text(f'#!/bin/sh\nprintf {said}\n')
+    text = """'{"asked": "%s", "home": "%s", "robot": "%s"}' "$*" "$SHADOWHOUND_HOME" "$SHADOWHOUND_ROBOT\""""
+    doctor.write_text(f'#!/bin/sh\nprintf {text}\n')
     doctor.chmod(0o700)
     monkeypatch.setattr(sys, 'executable', str(doctor))
     monkeypatch.setattr(module, 'find_spec', lambda _: None)  # no ROS here
@@ -115,9 +115,9 @@ def test_viewers_on_other_machines_are_known(tmp_path: Path, monkeypatch: pytest
 
 def test_video_is_suggested_on_a_link_that_stays_narrow(tmp_path: Path) -> None:
     """Each time that it was narrow for ten seconds without a break; not without a camera, and not without video support."""
-    told: list[LiveItem] = []
+    reports: list[LiveItem] = []
     viewer = Viewer()
-    one: Any = SimpleNamespace(viewer=viewer, narrow_s=None, tell=told.append)
+    one: Any = SimpleNamespace(viewer=viewer, narrow_s=None, tell=reports.append)
     server = closed_server(tmp_path)
     server.cameras.no_video, server.viewers.graph = (
         '',
@@ -127,12 +127,12 @@ def test_video_is_suggested_on_a_link_that_stays_narrow(tmp_path: Path) -> None:
 
     def suggested(seconds: float, *, narrow: bool) -> int:
         """How often within this time."""
-        told.clear()
+        reports.clear()
         viewer._sizes = dict.fromkeys((CAMERA, '/cloud'), HALF if narrow else FULL)
         for _ in range(round(seconds)):
             server.viewers.suggest_video(one, float(next(clock)))
-        assert all(item.kind == 'video' and item.head == {'narrow': True} for item in told)
-        return len(told)
+        assert all(item.kind == 'video' and item.head == {'narrow': True} for item in reports)
+        return len(reports)
 
     viewer.watch([CAMERA, '/cloud'])
     assert suggested(3 * NARROW_S, narrow=False) == 0
@@ -176,10 +176,10 @@ def test_a_page_on_a_narrow_link_is_notified(tmp_path: Path, monkeypatch: pytest
 
 def test_status_shows_what_uploads_wait_for(tmp_path: Path) -> None:
     """The rule and why it does not hold, and how long it takes until everything has arrived, as in the node's status."""
-    said = {'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}, 'left_s': 754}
-    written(tmp_path, store={'state': 'waiting', **said})
+    fields = {'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}, 'left_s': 754}
+    written(tmp_path, store={'state': 'waiting', **fields})
     store = SpoolFigures(tmp_path, 'thor', FakeClock()).now(with_ledger=False)['store']
-    assert {name: store[name] for name in said} == said
+    assert {name: store[name] for name in fields} == fields
 
 
 def test_a_failed_task_is_logged_immediately(

@@ -56,8 +56,8 @@ class Tab:
                     self.samples[head['of']] = head
                 elif head['kind'] == 'figures':  # each second, in which a page sends something too
                     await self._ws.send_json({'ping': 1})
-            if (said := frames.acknowledgement()) is not None:
-                await self._ws.send_bytes(said)
+            if (report := frames.acknowledgement()) is not None:
+                await self._ws.send_bytes(report)
 
 
 class Robot:

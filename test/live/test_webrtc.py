@@ -122,8 +122,8 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
             assert encoder.encoded <= len(found.at)
             assert all(CAMERA not in one.viewer.watched for one in found.server.viewers.connected)
             for tab in tabs:
-                told = [await tab.evaluate(shown) for _ in range(20)]
-                for level, at, _ in told:
+                reports = [await tab.evaluate(shown) for _ in range(20)]
+                for level, at, _ in reports:
                     number = min(range(len(found.at)), key=lambda place: abs(found.at[place] - at))
                     assert abs(found.at[number] - at) < 1, 'no frame arrived at this time'
                     assert abs(level - (20 + 18 * (number % LEVELS))) < 9, 'the time is that of another frame'
@@ -198,8 +198,8 @@ class Receiver:
             self._task = asyncio.create_task(self._read(track))
 
         await self.pc.setLocalDescription(await self.pc.createOffer())
-        said = {'topic': CAMERA, 'offer': self.pc.localDescription.sdp}
-        await self.video.take(self, said, ('127.0.0.1', '127.0.0.1'), lambda what: self.told.append(dict(what)))
+        fields = {'topic': CAMERA, 'offer': self.pc.localDescription.sdp}
+        await self.video.take(self, fields, ('127.0.0.1', '127.0.0.1'), lambda what: self.told.append(dict(what)))
         if answer := self.told[0].get('answer'):
             await self.pc.setRemoteDescription(aiortc.RTCSessionDescription(answer, 'answer'))
         return self.told[0]
@@ -294,10 +294,10 @@ def test_an_invalid_offer_is_answered_with_the_problem(offer: Any) -> None:
 
     async def run() -> None:
         video = webrtc.CameraVideo(lambda: None)
-        told: list[dict[str, Any]] = []
-        await video.take('viewer', {'topic': CAMERA, 'offer': offer}, ('127.0.0.1', '127.0.0.1'), told.append)
-        if told[0].get('answer') is None:
-            assert told[0]['problem']
+        reports: list[dict[str, Any]] = []
+        await video.take('viewer', {'topic': CAMERA, 'offer': offer}, ('127.0.0.1', '127.0.0.1'), reports.append)
+        if reports[0].get('answer') is None:
+            assert reports[0]['problem']
             assert not video.topics
         await video.close()
         assert not video.topics
@@ -313,18 +313,18 @@ def test_peers_and_cameras_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
 
     async def run() -> None:
         video = webrtc.CameraVideo(lambda: None)
-        told: dict[str, dict[str, Any]] = {}
+        fields: dict[str, dict[str, Any]] = {}
 
         async def ask(who: str, topic: str) -> bool:
-            await video.take(who, {'topic': topic, 'offer': OFFER}, addresses, lambda what: told.__setitem__(who, dict(what)))
-            return 'answer' in told[who]
+            await video.take(who, {'topic': topic, 'offer': OFFER}, addresses, lambda what: fields.__setitem__(who, dict(what)))
+            return 'answer' in fields[who]
 
         assert [await ask('a', '/1'), await ask('b', '/2'), await ask('c', '/3')] == [True, True, False]
-        assert 'cameras are encoded' in told['c']['problem']
+        assert 'cameras are encoded' in fields['c']['problem']
         assert await ask('c', '/2')
         assert not await ask('d', '/1')
-        assert 'viewers take video' in told['d']['problem']
-        assert '127.0.0.1' in told['a']['answer']
+        assert 'viewers take video' in fields['d']['problem']
+        assert '127.0.0.1' in fields['a']['answer']
         video.end('a')
         assert await ask('d', '/2')
         await video.close()

@@ -21,16 +21,16 @@ def jpeg(number: int) -> bytes:
 def main(home: str, command: str, csv: str, period_s: str = str(PERIOD_S)) -> None:
     """``csv`` is the trajectory that it logs, NO_CSV for none."""
     logger = MissionDataLogger(home=Path(home), start_timeout_s=0.2, frame_artifact_every_s=0.0)
-    said = f'{logger.start_mission("patrol", command)}\n'
+    text = f'{logger.start_mission("patrol", command)}\n'
     number = 0
     if csv != NO_CSV:
         logger.log_trajectory(csv)
     while True:
-        os.write(1, said.encode())
+        os.write(1, text.encode())
         logger.log_robot_state(90.0 - number / 1e4, 40.0, number)
         if number % FRAME_EVERY == 0:
             logger.log_camera_frame(jpeg(number), number)
-        said = f'{number}\n'
+        text = f'{number}\n'
         number += 1
         time.sleep(float(period_s))
 

@@ -32,12 +32,12 @@ def records(path: Path, offset: int = 0) -> list[object]:
 
 def test_a_journal_is_read_as_it_was_written(journal: Journal) -> None:
     """Records come back in order, floats to the last bit, and reading continues at the end of any line."""
-    said = [{'k': 'metrics', 'm': {'a': 0.1 + 0.2}, 't': 1 << 60}, {'k': 'event', 'name': 'Küche\n\0'}, {'k': 'end'}]
-    for record in said:
+    reports = [{'k': 'metrics', 'm': {'a': 0.1 + 0.2}, 't': 1 << 60}, {'k': 'event', 'name': 'Küche\n\0'}, {'k': 'end'}]
+    for record in reports:
         journal.append(record)
-    assert records(journal.path) == said
+    assert records(journal.path) == reports
     ends = [line.end for line in read(journal.path)]
-    assert [records(journal.path, end) for end in ends] == [said[1:], said[2:], []]
+    assert [records(journal.path, end) for end in ends] == [reports[1:], reports[2:], []]
     assert ends[-1] == journal.path.stat().st_size
 
 
@@ -69,14 +69,14 @@ def test_a_record_after_a_full_disk_is_complete(journal: Journal, monkeypatch: p
 @given(st.integers(0, 400), st.integers(1, 255))
 def test_corruption_is_detected(tmp_path_factory: pytest.TempPathFactory, place: int, flip: int) -> None:
     """Of a journal with a changed byte, every record that is read is one that was written, and at most two are missing."""
-    said = [{'k': 'metrics', 'n': number, 'v': number / 7} for number in range(10)]
-    data = bytearray(b''.join(map(line_of, said)))
+    reports = [{'k': 'metrics', 'n': number, 'v': number / 7} for number in range(10)]
+    data = bytearray(b''.join(map(line_of, reports)))
     data[place % len(data)] ^= flip
     path = tmp_path_factory.mktemp('rot') / 'journal'
     path.write_bytes(data)
     found = [record for record in records(path) if record is not None]
-    assert all(record in said for record in found)
-    assert len(found) >= len(said) - 2
+    assert all(record in reports for record in found)
+    assert len(found) >= len(reports) - 2
 
 
 def test_threads_share_a_journal(journal: Journal) -> None:

@@ -57,15 +57,15 @@ def test_a_mission_has_its_run_before_mlflow_is_loaded(server: Server, home: Pat
 @pytest.mark.seaweedfs
 def test_starting_a_mission_costs_one_request(server: Server, warm_home: Path) -> None:
     """The experiment is looked up by the constructor, and both take little CPU; bench/mission_calls.py measures the time."""
-    heard = bytearray()
-    with Wire(server.tower.tracking_uri, heard.extend) as wire:
+    received = bytearray()
+    with Wire(server.tower.tracking_uri, received.extend) as wire:
         logger = MissionDataLogger(home=warm_home, start_timeout_s=PATIENCE_S, tracking_uri=wire.url)
         began_s = time.process_time()
         first = logger.start_mission('patrol', 'a request 1')
         second = logger.start_mission('patrol', 'a request 2')
         took_s = time.process_time() - began_s
         ended(logger)
-    assert re.findall(rb'(?:GET|POST) /api/2.0/mlflow/([a-z-]+/[a-z-]+)', bytes(heard)) == [
+    assert re.findall(rb'(?:GET|POST) /api/2.0/mlflow/([a-z-]+/[a-z-]+)', bytes(received)) == [
         b'experiments/get-by-name', b'runs/create', b'runs/create',
     ]  # fmt: skip
     assert took_s < 0.2

@@ -155,9 +155,9 @@ def test_a_mission_records_the_active_policy(tmp_path: Path, logger: MissionData
         activate(tmp_path, name)
         logger.start_mission(f'patrol_{name is not None}', 'go round')
         logger.end_mission(True, 1.0, 2.0)
-    told = [(story.params().get('policy'), story.final_params().get('policies'), summary['policy'], summary['policies'],
+    reports = [(story.params().get('policy'), story.final_params().get('policies'), summary['policy'], summary['policies'],
              summary['policy_changes']) for story, summary in told_of(tmp_path)]  # fmt: skip
-    assert told == [(None, None, None, None, []), (NEW, None, NEW, NEW, [])]
+    assert reports == [(None, None, None, None, []), (NEW, None, NEW, NEW, [])]
 
 
 def test_a_rollback_during_a_mission_is_recorded(tmp_path: Path, logger: MissionDataLogger) -> None:

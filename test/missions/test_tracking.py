@@ -212,12 +212,12 @@ def test_a_killed_agents_mission_is_complete_and_killed(server: Server, home: Pa
     until(lambda: complete(home), 'its replayer sends it')
     run = server.run(command)
     (folder,) = missions(home)
-    said = [line.record for line in read(folder.journal) if line.record]
-    assert (run.info.status, run.info.end_time) == ('KILLED', said[-1]['t'] // 1_000_000)
+    reports = [line.record for line in read(folder.journal) if line.record]
+    assert (run.info.status, run.info.end_time) == ('KILLED', reports[-1]['t'] // 1_000_000)
     steps = [point.step for point in server.history(run.info.run_id, 'battery_pct')]
     assert steps == list(range(len(steps)))
     assert len(steps) > 300
-    frames = {record['id'] for record in said if record['k'] == 'frame'}
+    frames = {record['id'] for record in reports if record['k'] == 'frame'}
     assert frames >= set(range(0, 301, FRAME_EVERY))
     wanted = {f'camera/frame_{number:06d}.jpg' for number in frames}
     wanted |= {'summary.json', 'trajectories/trajectory.csv', 'battery.png'}

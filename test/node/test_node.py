@@ -42,8 +42,8 @@ def test_the_watchdog_is_pinged_several_times_per_interval(systemd: socket.socke
     for _ in range(50):
         service.alive()
         now += 0.42
-    told = [systemd.recv(1000) for _ in range(3)]
-    assert told == [b'WATCHDOG=1'] * 3
+    reports = [systemd.recv(1000) for _ in range(3)]
+    assert reports == [b'WATCHDOG=1'] * 3
     systemd.setblocking(False)
     with pytest.raises(BlockingIOError):
         systemd.recv(1000)

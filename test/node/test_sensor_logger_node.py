@@ -19,9 +19,9 @@ def variables(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_arguments_that_ros_would_ignore_are_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """Exit code 2, the argument by name, and where it belongs: rcl would silently run with the defaults."""
     assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert f'{arguments[0]!r} is not a valid argument' in said
-    assert '--ros-args' in said
+    captured = capsys.readouterr().err
+    assert f'{arguments[0]!r} is not a valid argument' in captured
+    assert '--ros-args' in captured
 
 
 @pytest.mark.parametrize('option', ['-h', '--help'])

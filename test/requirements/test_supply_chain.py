@@ -35,12 +35,12 @@ def test_a_bill_of_materials_names_its_subject(supply_chain: Any, tmp_path: Path
     """This package with its version, in addition to what the tool adds."""
     target = tmp_path / 'a.cdx.json'
     supply_chain.write(target, {'bomFormat': 'CycloneDX', 'metadata': {'tools': {'components': []}}, 'components': []})
-    told = json.loads(target.read_text())['metadata']
+    data = json.loads(target.read_text())['metadata']
     version = re.search(r'<version>(.+)</version>', (ROOT / 'package.xml').read_text())
     assert version is not None
-    assert (told['component']['name'], told['component']['version']) == ('shadowhound_data_logger', version[1])
-    assert told['component']['licenses'] == [{'license': {'id': 'Apache-2.0'}}]
-    assert 'tools' in told
+    assert (data['component']['name'], data['component']['version']) == ('shadowhound_data_logger', version[1])
+    assert data['component']['licenses'] == [{'license': {'id': 'Apache-2.0'}}]
+    assert 'tools' in data
 
 
 def test_a_machine_without_the_database_skips_the_audit(

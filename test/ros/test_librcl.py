@@ -91,14 +91,14 @@ def test_librcl_and_rclpy_agree(node: Any, monkeypatch: pytest.MonkeyPatch, *, l
             publisher.publish(cdr)
     both = (sorted(drained(each, len(sent)), key=attrgetter('source_ns')) for each in (by_rclpy, by_librcl))
     pairs = list(zip(*both, strict=True))
-    assert [(told.cdr, told.number) for _, told in pairs] == sent
-    assert {told.publisher for _, told in pairs} == set(gids)
-    for known, told in pairs:
-        assert told.cdr == known.cdr
-        assert told.source_ns == known.source_ns
-        assert known.number in {None, told.number}
-        assert known.publisher in {None, told.publisher}
-        assert abs(told.received_ns - known.received_ns) < 10 * 10**9
+    assert [(report.cdr, report.number) for _, report in pairs] == sent
+    assert {report.publisher for _, report in pairs} == set(gids)
+    for known, report in pairs:
+        assert report.cdr == known.cdr
+        assert report.source_ns == known.source_ns
+        assert known.number in {None, report.number}
+        assert known.publisher in {None, report.publisher}
+        assert abs(report.received_ns - known.received_ns) < 10 * 10**9
     for each in (by_rclpy, by_librcl):
         each.close()
 
@@ -139,8 +139,8 @@ def test_rclpy_reports_what_its_version_should(node: Any, monkeypatch: pytest.Mo
     publisher = node.create_publisher(String, '/told', 10)
     until(lambda: found.matched() == 1, 'it is matched')
     publisher.publish(String(data='x'))
-    (told,) = drained(found, 1)
-    assert (told.publisher is not None) is (reader.rclpy_version() >= reader.REPORTS_PUBLISHERS)
+    (report,) = drained(found, 1)
+    assert (report.publisher is not None) is (reader.rclpy_version() >= reader.REPORTS_PUBLISHERS)
     found.close()
 
 
@@ -242,7 +242,7 @@ def test_incorrect_message_info_is_not_trusted(
 ) -> None:
     """Messages are taken through rclpy then, and one warning has the reason."""
     take = librcl.Taker.take
-    monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (told := take(*given)) and WRONG[what](librcl.RclMessage(*told)))
+    monkeypatch.setattr(librcl.Taker, 'take', lambda *given: (report := take(*given)) and WRONG[what](librcl.RclMessage(*report)))
     readers = [read(node, f'/wrong{number}') for number in range(2)]
     assert [each._taker for each in readers] == [None, None]
     (record,) = caplog.records

@@ -82,8 +82,8 @@ def test_a_policy_is_published_evaluated_and_rolled_back(scene: Scene, listener:
             ('other', {'policy': first, 'failures': 99}), ('other', {'policy': '../../etc', 'failures': 99}),
             ('json', '[' * 4000),
         ]  # fmt: skip
-        for number, (_, told) in enumerate(bad, 1):
-            listener.say(told)
+        for number, (_, report) in enumerate(bad, 1):
+            listener.say(report)
             listener.until(lambda number=number: topics.ignored.total() == number, f'number {number} is ignored')
         assert dict(topics.ignored) == {reason: sum(each == reason for each, _ in bad) for reason, _ in bad}
         listener.say({'policy': second, 'failures': 3, 'p99_ms': 1.0})

@@ -184,10 +184,10 @@ class Pair:
         self._count = folder / 'count'
         program = str(HERE / 'publisher_and_listener.py')
         self.publisher = subprocess.Popen([sys.executable, program, 'publisher', str(self._count)], env=environ)
-        heard = folder / 'heard'
+        received = folder / 'heard'
         who = 'guarded' if is_guarded else 'listener'
-        self.listener = subprocess.Popen([sys.executable, program, who, str(heard)], env=environ)
-        until(heard.exists, 'the listener hears')
+        self.listener = subprocess.Popen([sys.executable, program, who, str(received)], env=environ)
+        until(received.exists, 'the listener hears')
         self.ports = ports_of(self.listener.pid)
         if not self.ports:
             pytest.skip('this middleware has no ports in shared memory')

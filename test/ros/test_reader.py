@@ -143,10 +143,10 @@ def test_messages_are_taken_from_a_subscription(node: Any) -> None:
     handle = subscription.handle
     with handle:
         assert handle.pointer
-        cdr, told = until(lambda: handle.take_message(String, True), 'it is taken')
+        cdr, report = until(lambda: handle.take_message(String, True), 'it is taken')
         assert handle.take_message(String, True) is None
     assert cdr[:4] == b'\0\1\0\0'
-    assert set(told) >= TOLD
+    assert set(report) >= TOLD
     node.destroy_subscription(subscription)
 
 

@@ -26,9 +26,9 @@ KEEP = KeepSettings(poll_s=10.0)
 def frame(number: int, *, body: bytes = b'', **fields: Any) -> DataObject:
     """An image that is kept on the robot, one per second."""
     stamp_ns = NOON_NS + number * SECOND
-    said = {meta.ROBOT: 'thor', meta.POSE: f'{number} 0 0 odom', meta.SHIP: meta.ON_REQUEST, **fields.pop('metadata', {})}
+    values = {meta.ROBOT: 'thor', meta.POSE: f'{number} 0 0 odom', meta.SHIP: meta.ON_REQUEST, **fields.pop('metadata', {})}
     return make(f'thor/camera/20251018/{number:06d}_front.jpg', body or b'%06d' % number, t_start_ns=stamp_ns, t_end_ns=stamp_ns,
-                metadata=said, **fields)  # fmt: skip
+                metadata=values, **fields)  # fmt: skip
 
 
 class Desk:

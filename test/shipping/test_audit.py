@@ -52,9 +52,9 @@ def remove(store: ObjectStore, item: SpooledObject) -> None:
 
 def overwrite(store: ObjectStore, item: SpooledObject, body: bytes, *, metadata: bool = True) -> None:
     """Put other content under the key, with the metadata of the object or without any."""
-    said = dict(item.metadata) if metadata else {}
+    fields = dict(item.metadata) if metadata else {}
     if isinstance(store, MemoryStore):
-        info = ObjectInfo(item.bucket, item.key, len(body), said.get('sha256'), said)
+        info = ObjectInfo(item.bucket, item.key, len(body), fields.get('sha256'), fields)
         store._objects[item.bucket, item.key] = info, body
     elif isinstance(store, DirectoryStore):
         store._path(item.bucket, item.key).write_bytes(body)
@@ -63,7 +63,7 @@ def overwrite(store: ObjectStore, item: SpooledObject, body: bytes, *, metadata:
     else:
         plain = store._s3 if isinstance(store, ObstoreStore) else store
         assert isinstance(plain, S3Store)
-        plain._client._client.put_object(Bucket=item.bucket, Key=item.key, Body=body, Metadata=said)
+        plain._client._client.put_object(Bucket=item.bucket, Key=item.key, Body=body, Metadata=fields)
 
 
 def kinds(found: Audit) -> dict[str, list[str]]:

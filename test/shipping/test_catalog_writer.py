@@ -242,11 +242,11 @@ def test_without_a_catalog_nothing_piles_up(spool: Spool, clock: FakeClock) -> N
 
 def test_statistics_are_in_separate_parts_once_the_object_is_delivered(spool: Spool, catalog: CatalogWriter) -> None:
     """One row per field and one for the object; none for evicted objects or those without statistics."""
-    said = {name: FieldStatistics() for name in 'ab'}
-    said['a'].add([{'x': 1.5}, {'x': None}])
-    said['b'].add([{'x': 9.0}])
-    told = {name: pack_statistics(each.result()) for name, each in said.items()}
-    first, second, third = put(spool, of('a', statistics=told['a']), of('b', statistics=told['b']), of('c'))
+    values = {name: FieldStatistics() for name in 'ab'}
+    values['a'].add([{'x': 1.5}, {'x': None}])
+    values['b'].add([{'x': 9.0}])
+    fields = {name: pack_statistics(each.result()) for name, each in values.items()}
+    first, second, third = put(spool, of('a', statistics=fields['a']), of('b', statistics=fields['b']), of('c'))
     assert catalog.parts() == []
     spool.commit(outcomes=[Outcome(second, State.EVICTED)])
     deliver(spool, [first, third])
@@ -267,9 +267,9 @@ def test_statistics_of_many_objects_go_into_several_parts(
 ) -> None:
     """Each in one part, under different names: all at the same time would take more memory than the rows."""
     monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.OBJECTS_A_PART', 2)
-    said = FieldStatistics()
-    said.add([{'x': 1.5}])
-    deliver(spool, put(spool, *(of(name, statistics=pack_statistics(said.result())) for name in 'abcde')))
+    report = FieldStatistics()
+    report.add([{'x': 1.5}])
+    deliver(spool, put(spool, *(of(name, statistics=pack_statistics(report.result())) for name in 'abcde')))
     made = [part for part in catalog.parts() if '/_stats/' in part.key]
     found = [lines(part.body) for part in made if isinstance(part.body, bytes)]
     assert [sorted({row['key'] for row in rows}) for rows in found] == [['a', 'b'], ['c', 'd'], ['e']]

@@ -46,11 +46,11 @@ def kept_slice(folder: Path, number: int, bag: str = BAG, **more: str) -> DataOb
     for one in recorded(number):
         writer.write({each.topic: each for each in (TALK, ECHO)}[one.topic], one.log_ns, one.publish_ns, one.sequence, one.cdr)
     info = writer.close()
-    said = {meta.ROBOT: 'thor', meta.BAG: bag, meta.SLICE: str(number), meta.MISSION_ID: 'm1',
+    fields = {meta.ROBOT: 'thor', meta.BAG: bag, meta.SLICE: str(number), meta.MISSION_ID: 'm1',
             meta.MISSION_TYPE: 'patrol'}  # fmt: skip
-    said |= {meta.SHIP: meta.ON_REQUEST, **more}
+    fields |= {meta.SHIP: meta.ON_REQUEST, **more}
     return make(f'thor/rosbags/{bag}/{bag}_{number}.mcap', FileBody(info.path, info.bytes, info.sha256), sensor='bag',
-                topic=None, type='', samples=0, t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, metadata=said,
+                topic=None, type='', samples=0, t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, metadata=fields,
                 counts={f'{ACCOUNT}/talk': SLICE_S * HERTZ // 2, f'{ACCOUNT}/echo': SLICE_S * HERTZ // 2})  # fmt: skip
 
 

@@ -112,13 +112,13 @@ def archive(
     members, first_ns, file = [], NOON_NS + number * SECOND, ''
     stamps = [first_ns + place * SECOND // count for place in range(count)]
     for place, stamp_ns in enumerate(stamps):
-        said: dict[str, object] = {'stamp_ns': stamp_ns, 'topic': '/camera'}
+        fields: dict[str, object] = {'stamp_ns': stamp_ns, 'topic': '/camera'}
         if repeats and place % 3 == 2:
-            said['repeat_of'] = file
+            fields['repeat_of'] = file
         else:
             file = f'{stamp_ns:019d}.jpg'
             members.append(ArchiveFile(file, stamp_ns, robot.body()))
-        members.append(ArchiveFile(f'{stamp_ns:019d}.json', stamp_ns, orjson.dumps(said)))
+        members.append(ArchiveFile(f'{stamp_ns:019d}.json', stamp_ns, orjson.dumps(fields)))
     kind = 'application/x-tar' if pack is pack_tar else 'application/zip'
     return make(f'thor/camera/20251018/{number:06d}.{"tar" if pack is pack_tar else "zip"}', pack(members), content_type=kind,
                 samples=count, t_start_ns=stamps[0], t_end_ns=stamps[-1], metadata=SHIP)  # fmt: skip
@@ -155,8 +155,8 @@ def messages_of(body: bytes, content_type: str) -> dict[int, bytes]:
     else:
         with tarfile.open(fileobj=BytesIO(body)) as unpacked:
             files = {each.name: file.read() for each in unpacked if (file := unpacked.extractfile(each))}
-    said = [orjson.loads(content) for name, content in files.items() if name.endswith('.json')]
-    return {one['stamp_ns']: files[one.get('repeat_of', f'{one["stamp_ns"]:019d}.jpg')] for one in said}
+    data = [orjson.loads(content) for name, content in files.items() if name.endswith('.json')]
+    return {one['stamp_ns']: files[one.get('repeat_of', f'{one["stamp_ns"]:019d}.jpg')] for one in data}
 
 
 @pytest.mark.parametrize(('count', 'seconds', 'min_hz', 'expected'), [

@@ -541,13 +541,13 @@ def test_an_object_that_is_protected_later_waits_for_the_same_rule(tmp_path: Pat
     index = Index(tmp_path / 'index.db')
     index.open()
     with closing(index), index.transaction():
-        for place, (sensor, said) in enumerate(itertools.product(sensors, facts)):
+        for place, (sensor, report) in enumerate(itertools.product(sensors, facts)):
             item = replace(data_object(place), sensor=sensor, protected=False)
-            index.states.insert(item, item.key, '0' * 64, State.PENDING, None, said, 0)
+            index.states.insert(item, item.key, '0' * 64, State.PENDING, None, report, 0)
             for protected in (False, True):
                 row = index.objects.row(item.bucket, item.key)
                 assert row is not None
-                assert row['waits_for'] == waits_for(sensor, said, protected=protected), (sensor, said, protected)
+                assert row['waits_for'] == waits_for(sensor, report, protected=protected), (sensor, report, protected)
                 index.states.protect(item.bucket, item.key)
 
 

@@ -62,8 +62,8 @@ def check(root: Path, bodies: Mapping[str, bytes]) -> dict[str, int]:
     sent = ship(spool)
     whole = set(bodies.values())
     assert set(sent.values()) <= whole, 'something was shipped that was never spooled'
-    told = any('ledger' in what or 'index' in what for what in done)
-    assert told or ledger.imbalances(ledger.read(root, 'thor')) == [], 'the ledger does not balance, and no finding reports it'
+    report = any('ledger' in what or 'index' in what for what in done)
+    assert report or ledger.imbalances(ledger.read(root, 'thor')) == [], 'the ledger does not balance, and no finding reports it'
     spool.close()
     again = new_spool(root)
     again.open()

@@ -212,8 +212,8 @@ def check(rotten: Rotten, bodies: Mapping[str, bytes]) -> dict[str, int]:
         if key not in rotten.touched and key != 'thor/a/0.jpg':  # it was delivered before
             assert body in sent.values() or body in lying, f'{key} is lost'
     assert rotten.planted <= set(sent.values()) | lying
-    told = any('ledger' in what for what in done)
-    assert told or ledger.imbalances(ledger.read(rotten.root, 'thor')) == []
+    report = any('ledger' in what for what in done)
+    assert report or ledger.imbalances(ledger.read(rotten.root, 'thor')) == []
     spool.close()
     again = new_spool(rotten.root)
     again.open()

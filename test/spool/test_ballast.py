@@ -158,10 +158,10 @@ def test_the_writer_loses_nothing_while_the_disk_accepts_nothing(
     assert writer.flush(60)
     assert assert_whole(root)['topics']['/camera']['stored'] == 3
     until(lambda: not writer.worker.failing)  # it is reported after the commit
-    told = [record.getMessage() for record in caplog.records if record.name.endswith('worker')]
-    assert len(told) == 2, told
-    assert 'cannot be written' in told[0]
-    assert 'works again after' in told[1]
+    reports = [record.getMessage() for record in caplog.records if record.name.endswith('worker')]
+    assert len(reports) == 2, reports
+    assert 'cannot be written' in reports[0]
+    assert 'works again after' in reports[1]
     assert 'Traceback' not in caplog.text
 
 

@@ -51,10 +51,10 @@ def test_a_bound_object_is_pending_under_its_final_name(spool: Spool, root: Path
     assert item.metadata == {'bound': 'yes', 'sha256': item.sha256}
     assert spool.pending(9) == [item]
     (row,) = rows(root)
-    said = description_of(item.path)
-    for found in (row, said):
+    report = description_of(item.path)
+    for found in (row, report):
         assert (found['key'], found['t_start_ns'], found['t_end_ns']) == (item.key, NOON_NS + 5, NOON_NS + 6)
-    assert (said['held'], said['metadata']) == (None, item.metadata)
+    assert (report['held'], report['metadata']) == (None, item.metadata)
     assert spool.reading.objects.held('clock') == []
     assert assert_whole(root)['objects']['pending'] == 1
 
@@ -74,9 +74,9 @@ def test_a_bound_object_keeps_its_topic(spool: Spool, root: Path) -> None:
     (binding,) = hold(spool, 'a', topic=None, counts={'bag:/imu': 3, 'bag:/odom': 1})
     before = description_of(root / HELD / 'thor/provisional/a')
     (item,) = spool.bind([binding])
-    said = description_of(item.path)
-    assert said['counts'] == before['counts'] == {'bag:/imu': 3, 'bag:/odom': 1}
-    assert said.keys() == before.keys()
+    report = description_of(item.path)
+    assert report['counts'] == before['counts'] == {'bag:/imu': 3, 'bag:/odom': 1}
+    assert report.keys() == before.keys()
 
 
 def test_final_names_are_unique(spool: Spool) -> None:
@@ -137,8 +137,8 @@ def test_a_failing_disk_binds_nothing(spool: Spool, root: Path, monkeypatch: pyt
         with pytest.raises(OSError, match='Input/output'):
             spool.bind(bindings)
     assert files(root) == before
-    said = description_of(root / HELD / 'thor/provisional/a')
-    assert (said['key'], said['held']) == ('thor/provisional/a', 'clock')
+    report = description_of(root / HELD / 'thor/provisional/a')
+    assert (report['key'], report['held']) == ('thor/provisional/a', 'clock')
     assert_whole(root)
     assert len(spool.bind(bindings)) == 2
     assert_whole(root)
@@ -209,8 +209,8 @@ def test_a_kill_at_any_moment_of_a_binding_loses_nothing(root: Path, moments: Mo
         assert len(set(bound)) == 1
         for row in rows(copy):
             place = f'{READY}/thor/final/{row["key"][-1]}' if bound[0] else f'{HELD}/thor/provisional/{row["key"][-1]}'
-            said = description_of(copy / place)
-            assert (said['key'], said['t_start_ns'], said['held']) == (row['key'], row['t_start_ns'], row['reason'])
+            report = description_of(copy / place)
+            assert (report['key'], report['t_start_ns'], report['held']) == (row['key'], row['t_start_ns'], row['reason'])
         spool.bind([final(item.id, item.key[-1]) for item in spool.reading.objects.held('clock')])
         for item in spool.pending(9):
             assert item.path.read_bytes() == item.key[-1].encode()

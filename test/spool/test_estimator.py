@@ -52,8 +52,8 @@ class Ear:
             batch = [stamp for stamp in waiting if stamp <= self.now_s * SECOND]
             if batch:
                 del waiting[: len(batch)]
-                heard = ArrivalContext(self.now_s, max(0.0, self.looked_s - self.heard_s))._replace(**context)  # type: ignore[arg-type]
-                found = self.estimator.observe([stamp + shift for stamp in batch], heard)
+                received = ArrivalContext(self.now_s, max(0.0, self.looked_s - self.heard_s))._replace(**context)  # type: ignore[arg-type]
+                found = self.estimator.observe([stamp + shift for stamp in batch], received)
                 self.heard_s = self.now_s
                 self.received += len(batch)
                 self.covered += found.covered

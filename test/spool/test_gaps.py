@@ -317,15 +317,15 @@ def test_objects_waiting_for_a_full_disk_are_not_settled(spool: Spool, monkeypat
     hear(spool, 2)
     writer = SpoolWriter(spool, 0.0)
     monkeypatch.setattr(spool.room, 'fits', lambda _: False)
-    told = []
-    writer.on_commit(settled=lambda _: told.append(watermark(spool)))
+    reports = []
+    writer.on_commit(settled=lambda _: reports.append(watermark(spool)))
     writer.put(make('b'))
     spool.commit()
     hear(spool, 3)
     writer.settle([Outcome(items[0], State.DELIVERED)])
     writer.open()
     assert writer.close(10)
-    assert told == [(0.1, 0.1)]
+    assert reports == [(0.1, 0.1)]
 
 
 def test_the_losses_of_a_kill_are_listed(root: Path, opened: Open) -> None:

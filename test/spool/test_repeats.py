@@ -40,8 +40,8 @@ def test_the_next_image_reports_the_repeats(spool: Spool) -> None:
     put(spool, picture(0))
     put(spool, picture(1), picture(2))
     (item,) = put(spool, picture(3, b'another'))
-    told = {name: value for name, value in item.metadata.items() if name.startswith('repeats')}
-    assert told == {'repeats': '2', 'repeats_of': picture(0).key, 'repeats_until_ns': str(picture(2).t_end_ns)}
+    fields = {name: value for name, value in item.metadata.items() if name.startswith('repeats')}
+    assert fields == {'repeats': '2', 'repeats_of': picture(0).key, 'repeats_until_ns': str(picture(2).t_end_ns)}
     (item,) = put(spool, picture(4, b'a third'))
     assert not any(name.startswith('repeats') for name in item.metadata)
 

@@ -81,8 +81,8 @@ def test_a_shortage_is_logged_at_start_and_end(opened: Open, clock: FakeClock, c
     clock.now_ns += 61 * SECOND
     settle(spool, spool.pending(1)[0], State.DELIVERED)
     settle(spool, spool.pending(1)[0], State.DELIVERED)
-    told = [re.split('[:;] ', record.getMessage())[-1] for record in caplog.records]
-    assert told == [f'evicted {count} objects so far, the least important first' for count in (1, 61)] + [
+    reports = [re.split('[:;] ', record.getMessage())[-1] for record in caplog.records]
+    assert reports == [f'evicted {count} objects so far, the least important first' for count in (1, 61)] + [
         '95 objects were evicted'
     ]
 
@@ -186,8 +186,8 @@ def test_a_payload_that_cannot_be_written_fails_the_commit(
 def test_every_kind_of_full_disk_is_the_same_error(spool: Spool) -> None:
     """Whether the index or a file detected it: a log that reports each new error once reports one."""
     errors = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), sqlite3.OperationalError('database or disk is full')
-    (told,) = {str(unwritable(spool.root, error)) for error in errors}
-    assert 'No space left on device' in told
+    (report,) = {str(unwritable(spool.root, error)) for error in errors}
+    assert 'No space left on device' in report
 
 
 def test_a_part_that_cannot_be_removed_stops_nothing(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch,

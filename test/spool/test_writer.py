@@ -60,15 +60,15 @@ def opened(spool: Spool) -> Iterator[Callable[..., SpoolWriter]]:
 
 def test_objects_are_durable_after_a_flush(opened: Callable[..., SpoolWriter], spool: Spool, root: Path) -> None:
     """A flush returns when all objects put before it are in the spool, and notifies the uploader of them."""
-    told: list[SpooledObject] = []
-    writing = opened(60.0, spooled=told.extend)
+    reports: list[SpooledObject] = []
+    writing = opened(60.0, spooled=reports.extend)
     for number in range(20):
         receive(spool)
         writing.put(make(f'{number}'))
     assert writing.flush(60)
     assert assert_whole(root)['objects']['pending'] == 20
     assert writing.written() == (20, 20)
-    assert sorted(item.key for item in told) == sorted(str(number) for number in range(20))
+    assert sorted(item.key for item in reports) == sorted(str(number) for number in range(20))
 
 
 def test_a_burst_is_one_commit(opened: Callable[..., SpoolWriter], commits: list[int]) -> None:

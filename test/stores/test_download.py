@@ -44,8 +44,13 @@ def test_content_has_the_size_of_the_object(store: ObjectStore, spool: Spool, bu
     store.put(item)
     for start in (0, 4, 10, 20):
         with store.content(bucket, 'a', start) as content:
-            told = content.info
-        assert (told.size, told.sha256, told.metadata['topic'], told.content_type) == (10, item.sha256, '/x', item.content_type)
+            report = content.info
+        assert (report.size, report.sha256, report.metadata['topic'], report.content_type) == (
+            10,
+            item.sha256,
+            '/x',
+            item.content_type,
+        )
 
 
 def test_a_range_of_a_missing_object_is_refused(store: ObjectStore, spool: Spool, bucket: str) -> None:
@@ -73,13 +78,13 @@ def wanted(bucket: str, size: int = len(CONTENT), sha256: str | None = None) -> 
 def test_a_download_has_the_content_of_the_object(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
     """The file has the content, progress was reported, and nothing else is left."""
     store.put(spool(KEY, CONTENT))
-    told: list[int] = []
+    reports: list[int] = []
     path = tmp_path / 'out' / 'a.mcap'
-    found = download(store, wanted(bucket), path, on_progress=told.append)
+    found = download(store, wanted(bucket), path, on_progress=reports.append)
     assert path.read_bytes() == CONTENT
     assert found.sha256 == found.info.sha256 == hashlib.sha256(CONTENT).hexdigest()
     assert found.is_verified
-    assert sum(told) == len(CONTENT)
+    assert sum(reports) == len(CONTENT)
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -87,9 +92,9 @@ def test_an_interrupted_download_resumes(store: ObjectStore, spool: Spool, bucke
     """Existing bytes are not downloaded again."""
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(CONTENT[: CHUNK_BYTES + 5])
-    told: list[int] = []
-    download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=told.append)
-    assert sum(told) == len(CONTENT) - CHUNK_BYTES - 5
+    reports: list[int] = []
+    download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=reports.append)
+    assert sum(reports) == len(CONTENT) - CHUNK_BYTES - 5
     assert (tmp_path / 'a.mcap').read_bytes() == CONTENT
 
 
@@ -98,10 +103,10 @@ def test_a_corrupt_download_restarts(store: ObjectStore, spool: Spool, bucket: s
     """Bytes that do not match are discarded, with a notice to the caller, and downloaded once more."""
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(there)
-    told = [len(there)]
-    download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=told.append)
+    reports = [len(there)]
+    download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=reports.append)
     assert (tmp_path / 'a.mcap').read_bytes() == CONTENT
-    assert sum(told) == len(CONTENT)
+    assert sum(reports) == len(CONTENT)
 
 
 @pytest.mark.parametrize('how', [{'size': 5}, {'sha256': '0' * 64}])
@@ -110,12 +115,12 @@ def test_a_download_with_wrong_content_leaves_no_file(
 ) -> None:
     """With a size or content other than expected: refused the second time, and nothing stays."""
     store.put(spool(KEY, CONTENT))
-    told: list[int] = []
+    reports: list[int] = []
     with pytest.raises(ObjectRefused, match='does not match its metadata') as caught:
-        download(store, wanted(bucket, **how), tmp_path / 'a.mcap', on_progress=told.append)
+        download(store, wanted(bucket, **how), tmp_path / 'a.mcap', on_progress=reports.append)
     assert caught.value.data['reason'] == 'damaged'
     assert list(tmp_path.glob('*.mcap*')) == []
-    assert sum(told) == 0
+    assert sum(reports) == 0
 
 
 def test_content_of_another_version_is_refused(store: ObjectStore, spool: Spool, bucket: str) -> None:
@@ -144,19 +149,19 @@ def known(store: ObjectStore, bucket: str, key: str) -> str:
 def test_a_download_of_a_changed_object_restarts(store: ObjectStore, spool: Spool, bucket: str, tmp_path: Path) -> None:
     """If a connection broke and the content has changed since, no byte of the old content stays."""
     store.put(spool(KEY, CONTENT))
-    told: list[int] = []
+    reports: list[int] = []
     after = os.urandom(len(CONTENT))
 
     def tell(size: int) -> None:
-        told.append(size)
-        if len(told) == 1:
+        reports.append(size)
+        if len(reports) == 1:
             assert store.replace(bucket, KEY, after, known(store, bucket, KEY))
             raise StoreUnavailable('cut')
 
     download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=tell, pause=lambda _: None)
     assert (tmp_path / 'a.mcap').read_bytes() == after
-    assert told[0] == -told[1] > 0
-    assert sum(told) == len(CONTENT)
+    assert reports[0] == -reports[1] > 0
+    assert sum(reports) == len(CONTENT)
 
 
 class Short(MemoryStore):

@@ -54,15 +54,15 @@ def test_a_server_without_an_answer_is_unavailable(fault: str, opened: Callable[
     with start() as url:
         store = opened(url, IMPATIENT if fault == 'hung' else QUICK)
         for ask in (lambda: store.put(spool('a', b'x')), store.probe, lambda: store.get('bucket', 'a')):
-            said = error_of(StoreUnavailable, ask)
-            assert words in said
-            assert url in said
+            report = error_of(StoreUnavailable, ask)
+            assert words in report
+            assert url in report
 
 
 def test_an_unknown_host_is_unavailable(opened: Callable[..., S3Store], spool: Spool) -> None:
     """A host name that does not resolve is not an outage of the server."""
-    said = error_of(StoreUnavailable, opened('http://tower.invalid:9000', IMPATIENT).probe)
-    assert 'the name of the S3 server at http://tower.invalid:9000 cannot be resolved' in said
+    report = error_of(StoreUnavailable, opened('http://tower.invalid:9000', IMPATIENT).probe)
+    assert 'the name of the S3 server at http://tower.invalid:9000 cannot be resolved' in report
 
 
 def test_every_wait_ends(opened: Callable[..., S3Store], spool: Spool) -> None:
@@ -93,9 +93,9 @@ def test_an_invalid_answer_means_an_unavailable_store(answer: str, opened: Calla
     status, body, kind, words = ANSWERS[answer]
     with served(FakeS3(answer=(status, body))) as server:
         store = opened(server.url)
-        said = error_of(kind, lambda: store.put(spool('a', b'x')))
-        assert words in said
-        assert server.url in said
+        report = error_of(kind, lambda: store.put(spool('a', b'x')))
+        assert words in report
+        assert server.url in report
         error_of(kind, store.probe)
 
 
@@ -147,8 +147,8 @@ def test_the_server_verifies_the_checksum(seaweed: Tower, spool: Spool, bucket: 
 def test_https_to_a_plain_port_is_named(opened: Callable[..., S3Store]) -> None:
     """The error explains that the port has no TLS."""
     with served(FakeS3()) as server:
-        said = error_of(StoreUnavailable, opened(server.url.replace('http:', 'https:')).probe)
-    assert 'no TLS connection' in said
+        report = error_of(StoreUnavailable, opened(server.url.replace('http:', 'https:')).probe)
+    assert 'no TLS connection' in report
 
 
 def test_a_name_and_a_password_in_the_url_are_not_sent(
@@ -158,11 +158,11 @@ def test_a_name_and_a_password_in_the_url_are_not_sent(
     with served(FakeS3()) as server:
         asked: list[tuple[str, str]] = []
         handler = server.RequestHandlerClass
-        told = handler._told  # type: ignore[attr-defined]
+        report = handler._told  # type: ignore[attr-defined]
 
         def tells(request: Any) -> bool:
             asked.append((request.headers['Host'], request.path.rpartition('/')[0].split('/')[1]))
-            return bool(told(request))
+            return bool(report(request))
 
         monkeypatch.setattr(handler, '_told', tells)
         store = opened(f'{server.url.replace("://", "://name:password@")}/base')
@@ -209,8 +209,8 @@ def test_without_credentials_the_variables_are_named(
     monkeypatch.setenv('AWS_CONFIG_FILE', str(tmp_path / 'none'))
     with served(FakeS3()) as server:
         store = opened(StoreSettings(endpoint_url=server.url))
-        said = error_of(CredentialsRejected, lambda: store.put(spool('a', b'x')))
-    assert 'AWS_ACCESS_KEY_ID' in said
+        report = error_of(CredentialsRejected, lambda: store.put(spool('a', b'x')))
+    assert 'AWS_ACCESS_KEY_ID' in report
 
 
 def test_a_profile_of_the_shell_does_not_affect_given_credentials(
@@ -233,9 +233,9 @@ def test_a_bucket_that_cannot_be_created_is_missing(
     def put() -> Put:
         return store.put(spool('a', b'x', bucket='allowed'))
 
-    said = error_of(BucketMissing, put, settings.secret_access_key or '')
-    assert f'the bucket allowed does not exist at {seaweed.endpoint_url}' in said
-    assert 's3 mb s3://allowed' in said
+    report = error_of(BucketMissing, put, settings.secret_access_key or '')
+    assert f'the bucket allowed does not exist at {seaweed.endpoint_url}' in report
+    assert 's3 mb s3://allowed' in report
     opened(seaweed.store_settings()).put(spool('b', b'x', bucket='allowed'))
     assert put() is Put.CREATED
 
@@ -245,8 +245,8 @@ def test_a_rejected_bucket_is_probed_once(opened: Callable[..., S3Store], spool:
     with served(FakeS3(without_buckets=True)) as server:
         store = opened(server.url)
         for _ in range(3):
-            said = error_of(BucketMissing, lambda: store.put(spool('a', b'x')))
-            assert 'may not create it' in said
+            report = error_of(BucketMissing, lambda: store.put(spool('a', b'x')))
+            assert 'may not create it' in report
         assert server.creations == 1
         monkeypatch.setattr(s3_puts, 'BUCKET_PAUSE_S', 0.0)
         error_of(BucketMissing, lambda: store.put(spool('a', b'x')))
@@ -259,8 +259,8 @@ def test_denied_is_not_missing(opened: Callable[..., S3Store], seaweed: Tower, s
     opened(seaweed.store_settings()).put(spool('a', b'x'))
     store = opened(seaweed.store_settings('limited'))
     store.probe()
-    said = error_of(AccessDenied, lambda: store.put(spool('b', b'x')))
-    assert f'denies these credentials {bucket}/b' in said
+    report = error_of(AccessDenied, lambda: store.put(spool('b', b'x')))
+    assert f'denies these credentials {bucket}/b' in report
     error_of(AccessDenied, lambda: store.head(bucket, 'a'))
 
 

@@ -92,11 +92,11 @@ def test_a_download_stops_at_the_announced_size(tmp_path: Path) -> None:
 
             return Content(ObjectInfo(bucket, key, 10, None), pieces())
 
-    store, told = Endless(), list[int]()
+    store, report = Endless(), list[int]()
     with pytest.raises(ObjectRefused) as caught:
-        download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', on_progress=told.append)
+        download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', on_progress=report.append)
     assert caught.value.data['why'] == 'it has more than 10 bytes'
-    assert (store.sent, sum(told), list(tmp_path.iterdir())) == (6, 0, [])
+    assert (store.sent, sum(report), list(tmp_path.iterdir())) == (6, 0, [])
 
 
 class Pages(ThreadingHTTPServer):

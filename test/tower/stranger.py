@@ -25,14 +25,14 @@ Answer = tuple[str, bytes]
 
 def ask(calls: Sequence[Call], namespace: str = '') -> list[Answer]:
     """The responses, in order; from another network namespace if given."""
-    told = _run({'call': [[host, port, method, body.hex()] for host, port, method, body in calls]}, namespace)['call']
-    return [(str(status), bytes.fromhex(message)) for status, message in told]
+    report = _run({'call': [[host, port, method, body.hex()] for host, port, method, body in calls]}, namespace)['call']
+    return [(str(status), bytes.fromhex(message)) for status, message in report]
 
 
 def reach(host: str, ports: Sequence[int], namespace: str = '') -> set[int]:
     """The ports that accept a connection."""
-    told = _run({'connect': [[host, port] for port in ports]}, namespace)['connect']
-    return {port for port, taken in zip(ports, told, strict=True) if taken}
+    report = _run({'connect': [[host, port] for port in ports]}, namespace)['connect']
+    return {port for port, taken in zip(ports, report, strict=True) if taken}
 
 
 def methods(host: str, port: int) -> list[str]:

@@ -157,13 +157,13 @@ def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, An
         program, *words = shlex.split(ours)[1:]
         mounts = {place: source for source, place in (volume.split(':')[:2] for volume in services['mlflow']['volumes'])}
         assert (TOWER / mounts[program]).resolve() == Path(mlflow_access.__file__)
-        told = mlflow_access.parser().parse_args([*words, '--', *shlex.split(theirs)])
-        assert mounts[str(told.users.parent)] == './mlflow'
-        assert told.command[:2] == ['mlflow', 'server']
-        assert told.command[told.command.index('--port') + 1] == '5000'
-        assert (told.password.parent, told.password.name in services['mlflow']['secrets']) == (told.folder, True)
+        data = mlflow_access.parser().parse_args([*words, '--', *shlex.split(theirs)])
+        assert mounts[str(data.users.parent)] == './mlflow'
+        assert data.command[:2] == ['mlflow', 'server']
+        assert data.command[data.command.index('--port') + 1] == '5000'
+        assert (data.password.parent, data.password.name in services['mlflow']['secrets']) == (data.folder, True)
     assert 'USER mlflow' in (TOWER / 'Dockerfile.mlflow').read_text()
-    assert f'install -d -o mlflow -g mlflow -m 0700 {told.folder}' in (TOWER / 'Dockerfile.mlflow').read_text()
+    assert f'install -d -o mlflow -g mlflow -m 0700 {data.folder}' in (TOWER / 'Dockerfile.mlflow').read_text()
     assert 'exec setpriv --reuid=mlflow' in services['mlflow']['entrypoint'][2]
     assert not {'user', 'entrypoint'} & set(secured['mlflow'])
     assert secured['mlflow']['secrets'] == ['tower.key']
@@ -272,8 +272,8 @@ def test_the_server_accepts_its_options(services: dict[str, Any], secured: dict[
     """Every option of the S3 server exists in `weed server`, in the version of the image."""
     weed = find_program('weed', '')
     command = shlex.split(secured['s3']['command'])
-    told = subprocess.run([weed, command[0], '-h'], capture_output=True, text=True, check=False)
-    known = set(re.findall(r'^  -([\w.]+)', told.stderr + told.stdout, re.MULTILINE))
+    done = subprocess.run([weed, command[0], '-h'], capture_output=True, text=True, check=False)
+    known = set(re.findall(r'^  -([\w.]+)', done.stderr + done.stdout, re.MULTILINE))
     assert {option.lstrip('-').partition('=')[0] for option in command[1:]} <= known
     version = subprocess.run([weed, 'version'], capture_output=True, text=True, check=True).stdout
     assert f' {services["s3"]["image"].partition(":")[2].partition("@")[0]} ' in version
@@ -282,6 +282,6 @@ def test_the_server_accepts_its_options(services: dict[str, Any], secured: dict[
 @pytest.mark.long('a Tower of its own')
 def test_mlflow_accepts_its_options(services: dict[str, Any]) -> None:
     """Every option of the MLflow server exists in `mlflow server`."""
-    told = subprocess.run([find_program('mlflow', ''), 'server', '--help'], capture_output=True, text=True, check=True)
+    done = subprocess.run([find_program('mlflow', ''), 'server', '--help'], capture_output=True, text=True, check=True)
     words = services['mlflow']['command'].partition(' -- ')[2].split()
-    assert {word for word in words if word.startswith('--')} <= set(re.findall(r'--[\w-]+', told.stdout))
+    assert {word for word in words if word.startswith('--')} <= set(re.findall(r'--[\w-]+', done.stdout))

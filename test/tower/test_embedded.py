@@ -128,8 +128,8 @@ def test_a_tower_leaves_only_its_folder(tmp_path: Path) -> None:
     tower.start()
     tower.start()
     assert len([command for command in _processes(tmp_path) if 'weed' in command and '_guard' not in command]) == 1
-    told = re.findall(r'-(\w+)\.port(\.grpc)?=(\d+)', ' '.join(_processes(tmp_path)))
-    sockets = [SOCKETS / f'seaweedfs-{name}{grpc.replace(".", "-")}-{port}.sock' for name, grpc, port in told]
+    text = re.findall(r'-(\w+)\.port(\.grpc)?=(\d+)', ' '.join(_processes(tmp_path)))
+    sockets = [SOCKETS / f'seaweedfs-{name}{grpc.replace(".", "-")}-{port}.sock' for name, grpc, port in text]
     tower.stop()
     tower.stop()
     assert not _processes(tmp_path)

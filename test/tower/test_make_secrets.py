@@ -87,9 +87,9 @@ def test_missing_secrets_are_added(tmp_path: Path) -> None:
     make_secrets.make(tmp_path, None, ['thor'])
     assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == {**before, **added}
     assert _modes(tmp_path) == {'0o600'}
-    told = make_secrets.read_env(tmp_path / 'secrets' / 'seaweedfs.env')
+    report = make_secrets.read_env(tmp_path / 'secrets' / 'seaweedfs.env')
     assert len(set(re.findall('key = "([0-9a-f]{64})"', (tmp_path / 'secrets' / 'security.toml').read_text()))) == 4
-    assert all((tmp_path / 'secrets' / value).is_file() for value in told.values())
+    assert all((tmp_path / 'secrets' / value).is_file() for value in report.values())
 
 
 def test_a_missing_openssl_is_reported(
@@ -222,9 +222,9 @@ def tower(tmp_path: Path, offset: int) -> Iterator[Path]:
     command = [sys.executable, str(TOWER / 'run.py'), '--folder', str(folder), '--offset', str(offset)]
     with (folder / 'log').open('w', encoding='utf-8') as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
         try:
-            said = folder / 'log'
-            until(lambda: 'credentials' in said.read_text() or process.poll() is not None, said.read_text, START_S)
-            assert process.poll() is None, said.read_text()
+            report = folder / 'log'
+            until(lambda: 'credentials' in report.read_text() or process.poll() is not None, report.read_text, START_S)
+            assert process.poll() is None, report.read_text()
             yield folder
         finally:
             process.terminate()
@@ -317,6 +317,6 @@ def test_a_robot_works_with_its_own_keys_during_rotations(
     kinds = {key.split('/')[1] for key in keys if key.count('/') > 1}
     assert kinds >= {'camera', 'imu', 'lidar', 'lowstate', 'odom', 'states', 'missions', 'rosbags', '_catalog', '_ledger'}
     assert any(key.endswith('manifest.json') for key in keys)
-    said = node.log + (node.home / 'spool' / 'status-thor.json').read_text()
-    said += ''.join(path.read_text(errors='replace') for path in (node.home / 'missions').rglob('*.log'))
-    assert not [secret for secret in secrets if secret in said]
+    text = node.log + (node.home / 'spool' / 'status-thor.json').read_text()
+    text += ''.join(path.read_text(errors='replace') for path in (node.home / 'missions').rglob('*.log'))
+    assert not [secret for secret in secrets if secret in text]

@@ -473,8 +473,8 @@ for one in fastapi_app.create_fastapi_app(app).routes:
     with tempfile.TemporaryDirectory() as folder:
         environ = {name: value for name, value in os.environ.items() if not name.startswith(('MLFLOW_', '_MLFLOW_'))}
         environ['_MLFLOW_SERVER_FILE_STORE'] = f'sqlite:///{folder}/a.db'
-        said = subprocess.run([sys.executable, '-c', program], env=environ, check=True, capture_output=True, text=True).stdout
-    return [(str(method), str(path)) for method, path in map(json.loads, said.splitlines())]
+        done = subprocess.run([sys.executable, '-c', program], env=environ, check=True, capture_output=True, text=True).stdout
+    return [(str(method), str(path)) for method, path in map(json.loads, done.splitlines())]
 
 
 @pytest.mark.long('imports all of MLflow')

@@ -113,9 +113,9 @@ def test_no_environment_and_no_command_line_has_the_key_of_the_store(folder: Pat
     secret = make_secrets.read_env(folder / '.env')['MLFLOW_SECRET_ACCESS_KEY'].encode()
     servers = _mlflow_processes(offset)
     assert servers
-    told = [(server / name).read_bytes() for server in servers for name in ('environ', 'cmdline')]
-    assert not any(secret in one for one in told)
-    named = {word.partition(b'=')[2].decode() for one in told for word in one.split(b'\0')
+    reports = [(server / name).read_bytes() for server in servers for name in ('environ', 'cmdline')]
+    assert not any(secret in one for one in reports)
+    named = {word.partition(b'=')[2].decode() for one in reports for word in one.split(b'\0')
              if word.startswith(b'AWS_SHARED_CREDENTIALS_FILE=')}  # fmt: skip
     (keys,) = (Path(name) for name in named)
     assert secret in keys.read_bytes()
@@ -149,9 +149,9 @@ def test_another_service_of_the_machine_reads_nothing_of_mlflow(folder: Path, of
     ask += '  socket.socket(socket.AF_UNIX).connect(path) if "PGSQL" in path else open(path).read()\n  print("read", path)\n'
     ask += ' except PermissionError:\n  print("denied")\n'
     command = ['setpriv', f'--reuid={user}', '--clear-groups', '/usr/bin/python3', '-c', ask, *wanted]
-    said = subprocess.run(command, check=True, capture_output=True, text=True, cwd='/').stdout.splitlines()
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd='/').stdout.splitlines()
     assert len(wanted) >= 3
-    assert said == ['denied'] * len(wanted)
+    assert done == ['denied'] * len(wanted)
 
 
 def test_a_password_of_mlflow_is_changed_while_it_runs(folder: Path, offset: int) -> None:

@@ -88,8 +88,8 @@ def embedded(folder: Path) -> Iterator[Running]:
     with Tower(folder, users={'thor': make_secrets.actions('thor')}) as tower:
         port = int(tower.endpoint_url.rpartition(':')[2])
         command = next(line for number in processes_of(folder) if '-s3.port=' in (line := _command(number)))
-        told = dict(word.lstrip('-').split('=', 1) for word in command.split('\0') if '.port=' in word)
-        ports = {name: int(told[f'{name}.port']) for name in PORTS}
+        fields = dict(word.lstrip('-').split('=', 1) for word in command.split('\0') if '.port=' in word)
+        ports = {name: int(fields[f'{name}.port']) for name in PORTS}
         assert ports['s3'] == port
         keys = {user: tower.environment(user) for user in ('tower', 'thor')}
         pairs = {user: {'accessKey': key['AWS_ACCESS_KEY_ID'], 'secretKey': key['AWS_SECRET_ACCESS_KEY']}
@@ -180,9 +180,9 @@ def made(folder: Path) -> Iterator[Running]:
         command = [sys.executable, str(TOWER / 'run.py'), '--folder', str(folder), '--offset', str(offset), '--bind', host]
         with subprocess.Popen(command, stdout=log, stderr=log) as process:
             try:
-                said = folder / 'log'
-                _until(lambda: 'credentials' in said.read_text() or process.poll() is not None, START_S, said.read_text)
-                assert process.poll() is None, said.read_text()
+                report = folder / 'log'
+                _until(lambda: 'credentials' in report.read_text() or process.poll() is not None, START_S, report.read_text)
+                assert process.poll() is None, report.read_text()
                 ports = {name: port + offset for name, port in PORTS.items() if name != 'admin'}
                 yield Running(host, ports, folder / 'secrets', users['tower'][0], users['thor'][0], namespace)
             finally:
@@ -257,9 +257,9 @@ def _becomes_administrator(target: Running) -> bool:
 @pytest.mark.long('a Tower of its own')
 def test_attacks_succeed_where_there_are_no_keys(opened: Running) -> None:
     """With its defaults SeaweedFS accepts each of them, and makes the client an administrator."""
-    told = _attack(opened, (HOST, ''), *ATTACKS)
-    assert {name: status for name, (status, _) in told.items() if status != 'OK'} == {}
-    assert opened.owner['secretKey'].encode() in told['read all keys'][1]
+    report = _attack(opened, (HOST, ''), *ATTACKS)
+    assert {name: status for name, (status, _) in report.items() if status != 'OK'} == {}
+    assert opened.owner['secretKey'].encode() in report['read all keys'][1]
     assert _becomes_administrator(opened)
 
 
@@ -275,8 +275,8 @@ def _lifecycle_deletes(target: Running) -> str:
     target.client(target.robot).put_object(Bucket='sensor-data', Key='thor/kept', Body=b'one')
     _, method, _ = ATTACKS['delete as the lifecycle does']
     body = field(1, b'sensor-data') + field(2, b'thor/kept') + field(5, 1)
-    told = {ask([(host, target.ports['s3'] + GRPC, method, body)], namespace)[0][0] for host, namespace in target.views}
-    (status,) = told
+    reported = {ask([(host, target.ports['s3'] + GRPC, method, body)], namespace)[0][0] for host, namespace in target.views}
+    (status,) = reported
     return status
 
 
@@ -300,8 +300,8 @@ def test_no_grpc_method_answers_without_a_key(opened: Running, closed: Running) 
         offered['admin'] = WORKERS
     for host, namespace in closed.views:
         calls = [(host, closed.ports[server] + GRPC, method, b'') for server, each in offered.items() for method in each]
-        told = zip(calls, ask(calls, namespace), strict=True)
-        assert [(call[1:3], answer) for call, answer in told if answer != (REFUSED, b'')] == []
+        report = zip(calls, ask(calls, namespace), strict=True)
+        assert [(call[1:3], answer) for call, answer in report if answer != (REFUSED, b'')] == []
 
 
 WORKERS: Final = ['/worker_pb.WorkerService/WorkerStream', '/plugin.PluginControlService/WorkerStream']
@@ -365,10 +365,10 @@ def test_valid_keys_keep_working(closed: Running) -> None:
     thor.put_object(Bucket='sensor-data', Key='thor/large', Body=body)
     assert thor.get_object(Bucket='sensor-data', Key='thor/large', Range='bytes=5-9')['Body'].read() == body[5:10]
     upload = thor.create_multipart_upload(Bucket='sensor-data', Key='thor/parts')['UploadId']
-    told = {'Bucket': 'sensor-data', 'Key': 'thor/parts', 'UploadId': upload}
-    parts = [{'PartNumber': number, 'ETag': thor.upload_part(**told, PartNumber=number, Body=part)['ETag']}
+    fields = {'Bucket': 'sensor-data', 'Key': 'thor/parts', 'UploadId': upload}
+    parts = [{'PartNumber': number, 'ETag': thor.upload_part(**fields, PartNumber=number, Body=part)['ETag']}
              for number, part in enumerate((body, b'end'), 1)]  # fmt: skip
-    thor.complete_multipart_upload(**told, MultipartUpload={'Parts': parts})
+    thor.complete_multipart_upload(**fields, MultipartUpload={'Parts': parts})
     assert thor.get_object(Bucket='sensor-data', Key='thor/parts')['Body'].read() == body + b'end'
     with pytest.raises(ClientError, match='AccessDenied'):
         thor.get_object(Bucket='sensor-data', Key='tachi/large')

@@ -196,7 +196,7 @@ def test_metadata_records_may_be_between_messages(tmp_path: Path) -> None:
         writer.add_metadata('of_mine', {'number': '1', 'text': 'ü' * 1000})
         written += fill(writer, list(messages(20))[10:])
         writer.sync()
-        assert [said['number'] for said in read_metadata(tmp_path / f'{name}.mcap.open', 'of_mine')] == ['0', '1']
+        assert [report['number'] for report in read_metadata(tmp_path / f'{name}.mcap.open', 'of_mine')] == ['0', '1']
         if name == 'closed':
             writer.close()
         else:
@@ -209,7 +209,7 @@ def test_metadata_records_may_be_between_messages(tmp_path: Path) -> None:
             reader = make_reader(file)
             assert [one.name for one in reader.iter_metadata()] == ['of_mine', 'of_mine', 'rosbag2']
             assert reader.get_summary().statistics.metadata_count == 3  # type: ignore[union-attr]
-        assert [said['number'] for said in read_metadata(path, 'of_mine')] == ['0', '1']
+        assert [report['number'] for report in read_metadata(path, 'of_mine')] == ['0', '1']
     assert (tmp_path / 'closed.mcap').stat().st_size == (tmp_path / 'killed.mcap').stat().st_size
     torn = (tmp_path / 'closed.mcap').read_bytes()[:100]
     (tmp_path / 'torn').write_bytes(torn)

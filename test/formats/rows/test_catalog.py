@@ -67,8 +67,8 @@ def test_an_invalid_position_is_null(gps: str) -> None:
 
 def test_a_time_since_boot_has_no_date() -> None:
     """An object of a clock that was never set has its times since boot, no date, and the folder of those."""
-    told = {'robot': 'thor', 'boot_start_ns': str(5 * SECOND), 'boot_end_ns': str(6 * SECOND), 'clock': 'unset'}
-    found = row(told, 'thor/_unsynced/b/camera/00000005_000_camera.jpg')
+    fields = {'robot': 'thor', 'boot_start_ns': str(5 * SECOND), 'boot_end_ns': str(6 * SECOND), 'clock': 'unset'}
+    found = row(fields, 'thor/_unsynced/b/camera/00000005_000_camera.jpg')
     assert (found['t_start_ns'], found['t_end_ns']) == (5 * SECOND, 6 * SECOND)
     assert (found['t_start'], found['t_end']) == (None, None)
     assert catalog.date_of(found) == '1970-01-01'

@@ -50,9 +50,9 @@ def some(count: int) -> list[catalog.Row]:
     rows = []
     for number in range(count):
         ns = 1_760_788_800_000_000_000 + number * 500_000_000
-        told = {'robot': 'thor', 'sensor': 'camera', 't_start_ns': str(ns), 't_end_ns': str(ns), 'sha256': f'{number:064x}',
+        fields = {'robot': 'thor', 'sensor': 'camera', 't_start_ns': str(ns), 't_end_ns': str(ns), 'sha256': f'{number:064x}',
                 'pose': f'{number}.5 -1.0 0.5 odom', 'run_id': 'r1'}  # fmt: skip
-        rows.append(catalog.row_of('sensor-data', f'thor/camera/{number:06d}.jpg', number, 'image/jpeg', told))
+        rows.append(catalog.row_of('sensor-data', f'thor/camera/{number:06d}.jpg', number, 'image/jpeg', fields))
     for row in rows[::3]:
         row.update(run_id=None, x=None, y=None, yaw=None, pose_frame=None, sensor='lidar')
     return rows
@@ -60,8 +60,8 @@ def some(count: int) -> list[catalog.Row]:
 
 def line(**changed: Any) -> bytes:
     """A valid line of kind ``object``, with some values changed; None removes one."""
-    told = {'row': 'object', **some(1)[0], **changed}
-    return orjson.dumps({name: value for name, value in told.items() if value is not None}) + b'\n'
+    fields = {'row': 'object', **some(1)[0], **changed}
+    return orjson.dumps({name: value for name, value in fields.items() if value is not None}) + b'\n'
 
 
 @settings(deadline=None, max_examples=examples(50))

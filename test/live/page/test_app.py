@@ -96,8 +96,8 @@ def test_the_rates_are_the_robots(page: Page) -> None:
         found = {}
         end_s = time.monotonic() + 2.5
         while not found and time.monotonic() < end_s:
-            told = {topic: (cell(page, topic, 'rate'), cell(page, topic, 'age'), hz) for topic, hz in SHOWN_HZ.items()}
-            found = {topic: (rate, age_s) for topic, (rate, age_s, hz) in told.items()
+            fields = {topic: (cell(page, topic, 'rate'), cell(page, topic, 'age'), hz) for topic, hz in SHOWN_HZ.items()}
+            found = {topic: (rate, age_s) for topic, (rate, age_s, hz) in fields.items()
                      if not (abs(rate - hz) <= hz / 10 and age_s <= (0.3 if hz >= 10 else 1.0))}  # fmt: skip
         return found
 

@@ -48,8 +48,8 @@ def test_the_page_survives_an_outage_of_the_store(browser: Browser, tmp_path: Pa
             served.run(served.server.past.history._end())  # data already read would be enough for a while
             press(page.get_by_role('button', name='10 seconds back'))
             page.locator('.timeline [role=alert]').first.wait_for()
-            said = page.locator('.timeline [role=alert]').first.inner_text()
-            assert tower.endpoint_url in said
+            text = page.locator('.timeline [role=alert]').first.inner_text()
+            assert tower.endpoint_url in text
             assert page.evaluate('document.querySelectorAll("rect.recorded").length') > 1
             tower.start_s3()
             press(page.get_by_role('button', name='1 second on'))

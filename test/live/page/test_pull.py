@@ -32,10 +32,10 @@ def test_an_operator_requests_kept_data(browser: Browser, tmp_path: Path, monkey
         settings = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
         with Served(settings, monkeypatch) as served:
             page = opened(browser, served.server.url)
-            ask, said = page.locator('[data-act=pull]'), page.locator('.pull')
+            ask, report = page.locator('[data-act=pull]'), page.locator('.pull')
             holds(page, "document.querySelectorAll('rect.kept').length === 1 && document.querySelector('[data-offer]')")
             assert ask.count() == 0
-            assert 'an operator can request them' in said.inner_text()
+            assert 'an operator can request them' in report.inner_text()
             press(page.get_by_role('button', name='Sign in', exact=True))
             page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
             press(page.locator('dialog button.primary'))

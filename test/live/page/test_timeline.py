@@ -219,14 +219,14 @@ def test_losses_are_shown_until_acknowledged(browser: Browser, tmp_path: Path, m
     columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']
     gaps = [['objects', '/imu', 'missed', 'restart', now_ms - 600_000, now_ms - 590_000, 12, 'exact'],
             ['bags', '/imu', 'missed', 'restart', now_ms - 600_000, now_ms - 590_000, 12, 'exact']]  # fmt: skip
-    told = {'from': now_ms - 3.6e6, 'to': now_ms, 'now': now_ms, 'columns': columns, 'gaps': gaps, 'known': []}
+    fields = {'from': now_ms - 3.6e6, 'to': now_ms, 'now': now_ms, 'columns': columns, 'gaps': gaps, 'known': []}
     row = {'topic': '/imu', 'type': IMU, 'sensor': 'imu', 'missed': 12, 'missed_estimated': None, 'unavailable': '', 'lost': 0,
            'rate_hz': 50.0, 'age_s': 0.01, 'publishers': 1, 'may_be_silent': False, 'received': 99, 'stored': 99}  # fmt: skip
     figures = {'robot': 'thor', 'state': 'running', 'age_s': 0.1, 'paused': False, 'queue': {}, 'findings': [], 'balanced': True,
                'spool': {}, 'store': {}, 'objects': {}, 'bytes': {}, 'topics': [row]}  # fmt: skip
     with Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch) as served:
         monkeypatch.setattr(served.server._figures, 'now', lambda **_: figures)
-        monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: told)
+        monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: fields)
         page = opened(browser, served.server.url)
         holds(page, 'document.querySelector("[data-losses]")?.dataset.losses === "12"')
         assert 'The node was not running' in page.locator('[data-losses]').inner_text()

@@ -198,19 +198,19 @@ def test_waiting_uploads_name_their_rule_and_duration(browser: Browser, tmp_path
     """As in the node's status: the rule and why it does not hold, or when everything will have arrived."""
     spool, clock = tmp_path / 'spool', SystemClock.of_this_machine()
     served = Served(LiveSettings(spool=spool, robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
-    said: dict[str, Any] = {'state': 'waiting', 'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}}
+    fields: dict[str, Any] = {'state': 'waiting', 'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}}
 
     def shows() -> list[str]:
         """The text of the page, for a running node."""
-        written(spool, boot_id=clock.boot_id, boot_ns=clock.boot_ns(), spool={'pending': 7}, store=said)
+        written(spool, boot_id=clock.boot_id, boot_ns=clock.boot_ns(), spool={'pending': 7}, store=fields)
         texts: list[str] = page.locator('[data-field=waits-for], [data-field=left]').all_inner_texts()
         return texts
 
     try:
         page = opened(browser, served.server.url)
-        told = ['waits for wifi.ssid == "lab": it is "cafe"', 'once a rule holds']
-        until(lambda: shows() == told, lambda: f'the rule is shown: {shows()}')
-        said |= {'state': 'shipping', 'mbps': 2.0, 'left_s': 754, 'waits_for': {}}
+        reports = ['waits for wifi.ssid == "lab": it is "cafe"', 'once a rule holds']
+        until(lambda: shows() == reports, lambda: f'the rule is shown: {shows()}')
+        fields |= {'state': 'shipping', 'mbps': 2.0, 'left_s': 754, 'waits_for': {}}
         until(lambda: shows() == ['13 min'], lambda: f'the time is shown: {shows()}')
         page.close()
     finally:

@@ -181,8 +181,8 @@ def test_unreadable_odometry_is_skipped(cdr: bytes) -> None:
 
 def test_a_frame_id_is_one_word() -> None:
     """Whatever the odometry contains, the pose is four words of ASCII; between two frames there is none."""
-    said = marked(walking([(t, odometry(1, 2, 0, 'my odöm\n')) for t in (0.0, 0.1)]), 0.05)['pose']
-    assert said == '1.000 2.000 0.0000 my_od_m_'
+    report = marked(walking([(t, odometry(1, 2, 0, 'my odöm\n')) for t in (0.0, 0.1)]), 0.05)['pose']
+    assert report == '1.000 2.000 0.0000 my_od_m_'
     found = walking([(0.0, odometry(1, 2, 0, 'odom')), (0.2, odometry(9, 9, 0, 'map'))])
     assert pose(found, 0.1) is None
 
@@ -194,8 +194,8 @@ def test_the_battery_is_the_nearest_one_known() -> None:
     assert track is not None
     track.add(ns(0.0), charge(80.0))
     track.add(ns(10.0), charge(79.5))
-    told = [marked(found, t).get('battery_pct') for t in (-31.0, -29.0, 4.0, 6.0, 39.0, 41.0)]
-    assert told == [None, '80', '80', '79.5', '79.5', None]
+    reports = [marked(found, t).get('battery_pct') for t in (-31.0, -29.0, 4.0, 6.0, 39.0, 41.0)]
+    assert reports == [None, '80', '80', '79.5', '79.5', None]
 
 
 def test_any_battery_state_is_one_by_default() -> None:
@@ -284,20 +284,20 @@ def test_encoders_ask_while_the_intake_adds() -> None:
     """Every pose they get is on the straight line of the robot's motion."""
     found = robot()
     track: Any = found.of('/odom', ODOMETRY)
-    told: list[tuple[float, tuple[float, float, float]]] = []
+    reports: list[tuple[float, tuple[float, float, float]]] = []
     ended = threading.Event()
 
     def ask() -> None:
         while not ended.is_set():
-            told.extend((t, at) for t in (0.5, 5.5, 9.9) if (at := pose(found, t)) is not None)
+            reports.extend((t, at) for t in (0.5, 5.5, 9.9) if (at := pose(found, t)) is not None)
 
     asking = threading.Thread(target=ask)
     asking.start()
     for number in range(500):
         track.add(ns(number / 50), odometry(number / 50, 0.0, 0.0))
-    while pose(found, 9.9) is None or not told:
+    while pose(found, 9.9) is None or not reports:
         pass
     ended.set()
     asking.join()
-    assert told
-    assert all(at[0] == pytest.approx(t, abs=0.002) for t, at in told)
+    assert reports
+    assert all(at[0] == pytest.approx(t, abs=0.002) for t, at in reports)

@@ -62,9 +62,9 @@ def test_every_discovery_range_is_translated() -> None:
     assert network(ROS_AUTOMATIC_DISCOVERY_RANGE='SYSTEM_DEFAULT', ROS_STATIC_PEERS='10.0.0.9') == Network()
     found = network(ROS_STATIC_PEERS='10.0.0.9; 10.0.0.8')
     assert (found.multicast, found.peers) == (True, ('10.0.0.9', '10.0.0.8'))
-    told = announced_to(found, 5)
-    assert told[0] == ('239.255.0.1', 8650)
-    assert {address for address, _ in told[1:]} == {'127.0.0.1', '10.0.0.2', '192.168.1.7', '10.0.0.9', '10.0.0.8'}
+    report = announced_to(found, 5)
+    assert report[0] == ('239.255.0.1', 8650)
+    assert {address for address, _ in report[1:]} == {'127.0.0.1', '10.0.0.2', '192.168.1.7', '10.0.0.9', '10.0.0.8'}
 
 
 @pytest.mark.parametrize(
@@ -100,10 +100,10 @@ def test_peers_of_cyclone_dds_are_used(tmp_path: Path) -> None:
     for reference in (f'file://{file}', str(file)):
         found = network(CYCLONEDDS_URI=f'{reference},{general("<AllowMulticast>false</AllowMulticast>")}')
         assert (found.peers, found.multicast, found.max_index) == (('10.0.0.9', '127.0.0.1:7411'), False, 40)
-    told = announced_to(found, 5)
-    assert ('127.0.0.1', 7411) in told
-    assert ('10.0.0.9', 7400 + 250 * 5 + 10 + 80) in told
-    assert ('10.0.0.2', 8660) in told, 'peers on this machine are notified as well'
+    report = announced_to(found, 5)
+    assert ('127.0.0.1', 7411) in report
+    assert ('10.0.0.9', 7400 + 250 * 5 + 10 + 80) in report
+    assert ('10.0.0.2', 8660) in report, 'peers on this machine are notified as well'
     assert network(CYCLONEDDS_URI=f'file://{tmp_path}/none.xml') == Network()
 
 

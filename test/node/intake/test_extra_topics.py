@@ -101,8 +101,8 @@ def test_unconfigured_topics_are_limited(
         crowd(robot, '/named')
         assert recording.until(lambda found: '/named' in found and len(found) == 4)
         recording.poll()
-    told = [record for record in caplog.records if 'not recorded' in record.message]
-    assert len(told) == 1
+    reports = [record for record in caplog.records if 'not recorded' in record.message]
+    assert len(reports) == 1
     assert recording.bags.topics == {source.topic for source in recording.extra.own}
 
 

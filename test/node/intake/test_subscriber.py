@@ -173,8 +173,8 @@ def test_the_configured_type_wins(
     assert totals.open == 5 + HISTORY
     (row,) = logger.accounts.snapshot({}).topics  # type: ignore[union-attr]
     assert row.rejected == {'wrong_type': refused}
-    said = {STRING: OtherType(('/squatter',), refused)}
-    logger.until(lambda: logger.totals('/odom').other_types == said, 'its node is known, which its messages do not wait for')
+    fields = {STRING: OtherType(('/squatter',), refused)}
+    logger.until(lambda: logger.totals('/odom').other_types == fields, 'its node is known, which its messages do not wait for')
 
 
 def test_an_uninstalled_type_is_reported(make: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:

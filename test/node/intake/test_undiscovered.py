@@ -49,9 +49,9 @@ def test_an_undiscovered_publisher_is_reported_until_it_is_found(caplog: pytest.
         '/imu': '/imu is not fully received: rmw_theirs finds a publisher (of /go2_driver) that rmw_ours, by which '
         'the node listens, has not found; what it sends is not logged'
     }
-    (told,) = caplog.records
-    assert told.levelno == logging.ERROR
-    assert 'capture.rmw: robot' in told.message
+    (report,) = caplog.records
+    assert report.levelno == logging.ERROR
+    assert 'capture.rmw: robot' in report.message
     robot.ours = {'/imu': {'aa'}}
     robot.wait(STEP_S)
     assert robot.texts == {}

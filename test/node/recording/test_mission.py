@@ -147,7 +147,7 @@ def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitSta
     end_ns = int(journal.last(folder.journal)['t'])
     assert setting.watch.mark(thing(end_ns)).metadata == {**marked, 'run_id': 'run7'}, 'it was on its way'
     assert setting.watch.mark(thing(end_ns + 1)).metadata == {'robot': 'thor'}
-    assert [(bool(told), told.run_id) for told in setting.told] == [(True, None), (True, 'run7'), (False, None)]
+    assert [(bool(report), report.run_id) for report in setting.told] == [(True, None), (True, 'run7'), (False, None)]
 
 
 def test_a_mark_has_the_agents_spelling(tmp_path: Path, opened: ExitStack) -> None:

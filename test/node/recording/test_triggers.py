@@ -52,14 +52,14 @@ def test_the_charge_of_a_battery_state_is_compared_as_the_message_has_it() -> No
     (condition,) = conditions(['low: battery:percentage < 0.3'])
     judge, kind = ConditionState(condition), STORE.types[BATTERY_STATE]
     stamp, none = STORE.types['builtin_interfaces/msg/Time'](0, 0), np.empty(0, np.float32)
-    told = []
+    reports = []
     for share in (0.73, 0.25, float('nan')):
         header = STORE.types['std_msgs/msg/Header'](stamp, '')
         message = kind(header, 28.5, 31.0, -2.0, 10.0, 15.0, 15.0, share, 2, 1, 3, True, none, none, '', '')
         value = number_at(message, condition.test.path.split('.'))
         assert value is not None
-        told.append((judge.poll(value, 10.0 * len(told)), battery_pct(message, condition.test.path.split('.'))))
-    assert told == [(False, 73.0), (True, 25.0), (False, None)]
+        reports.append((judge.poll(value, 10.0 * len(reports)), battery_pct(message, condition.test.path.split('.'))))
+    assert reports == [(False, 73.0), (True, 25.0), (False, None)]
 
 
 def test_an_agent_event_triggers_once(tmp_path: Path) -> None:
@@ -70,13 +70,13 @@ def test_an_agent_event_triggers_once(tmp_path: Path) -> None:
     journal.create()
     journal.append({'k': 'start', 't': NOW_NS})
     journal.append({'k': 'event', 't': NOW_NS - 10**9, 'name': 'fall', 'data': {'leg': 2}})
-    (told,) = tail.new(NOW_NS)
-    assert (told.name, told.age_ns, told.data) == ('fall', 10**9, {'leg': 2})
+    (report,) = tail.new(NOW_NS)
+    assert (report.name, report.age_ns, report.data) == ('fall', 10**9, {'leg': 2})
     assert list(tail.new(NOW_NS)) == []
     journal.append({'k': 'event', 't': NOW_NS, 'name': 'second'})
     with (tmp_path / 'journal').open('ab') as file:
         file.write(b'0000')
-    assert [told.name for told in tail.new(NOW_NS)] == ['second']
+    assert [report.name for report in tail.new(NOW_NS)] == ['second']
     journal.close()
 
 
@@ -86,5 +86,5 @@ def test_an_old_agent_event_does_not_trigger(tmp_path: Path) -> None:
     journal.create()
     for age_ns in (10 * LATE_NS, LATE_NS // 2):
         journal.append({'k': 'event', 't': NOW_NS - age_ns, 'name': str(age_ns)})
-    assert [told.name for told in JournalTail(tmp_path / 'journal').new(NOW_NS)] == [str(LATE_NS // 2)]
+    assert [report.name for report in JournalTail(tmp_path / 'journal').new(NOW_NS)] == [str(LATE_NS // 2)]
     journal.close()

@@ -52,11 +52,11 @@ def raw(serving: Serving, name: str = 'control.sock') -> socket.socket:
 
 def heard(client: socket.socket) -> list[dict[str, Any]]:
     """Everything that the node sends until it closes the connection."""
-    said = b''
+    report = b''
     with suppress(ConnectionResetError):
         while more := client.recv(1 << 16):
-            said += more
-    return [json.loads(line) for line in said.splitlines()]
+            report += more
+    return [json.loads(line) for line in report.splitlines()]
 
 
 def works(serving: Serving) -> bool:
@@ -274,10 +274,10 @@ def test_a_killed_node_is_detected(tmp_path: Path) -> None:
         with address(tmp_path, 'control.sock') as there:
             listener.bind(there)
         listener.listen()
-        for said in (b'', b'{"ok": tr', b'nonsense\n', b'[]\n'):
+        for report in (b'', b'{"ok": tr', b'nonsense\n', b'[]\n'):
             with closing(Connection(tmp_path, 'control.sock', WAIT_S)) as connection:
                 node, _ = listener.accept()
-                node.sendall(said)
+                node.sendall(report)
                 node.shutdown(socket.SHUT_WR)
                 with pytest.raises(NodeUnavailable, match='no longer answers'):
                     connection.ask('flush')
