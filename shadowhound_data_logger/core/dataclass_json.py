@@ -19,6 +19,8 @@ def fields_of(value: Any) -> dict[str, Any]:
 
 def as_plain(value: Any) -> Any:
     """The value as dicts, lists and plain values."""
+    if value is None or isinstance(value, (str, int, float)):
+        return value
     if is_dataclass(value):
         value = fields_of(value)
     if isinstance(value, Mapping):
@@ -59,7 +61,7 @@ def _hints(kind: type[Any]) -> dict[str, Any]:
 
 
 def _value(hint: Any, given: Any, at: str) -> Any:
-    if hint is Any:
+    if hint is Any or type(given) is hint:
         return given
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in {Union, UnionType}:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -56,7 +57,8 @@ class SpoolFigures:
                 self._ledger, self._problem = ledger.read(self._spool, self._robot), ''
             except DataLoggerError as error:
                 self._ledger, self._problem = None, str(error)
-        found, live, status = self._ledger, report.node.topics, report.as_dict()
+        found, live = self._ledger, report.node.topics
+        status = replace(report, node=replace(report.node, topics={})).as_dict()
         accounts = found['topics'] if found else {}
         return {
             **{name: status.get(name) for name in _HEAD},

@@ -54,8 +54,8 @@ MAX_CONNECTIONS: Final = 200
 IDLE_S: Final = 15.0
 """Between requests."""
 FIGURES_S: Final = 1.0
-LEDGER_EVERY: Final = 2
-"""The ledger is read with every second status."""
+LEDGER_EVERY: Final = 4
+"""The ledger, which takes several times as long to read as the status, is read with every fourth."""
 CHECK_S: Final = 5.0
 """Interval of checking whether viewers are still signed in."""
 LEASE_EVERY_S: Final = 2.0
@@ -254,7 +254,7 @@ class LiveServer:
             if self._settings.uploads_mbps and began_s >= lease_s and self.viewers.is_watched_remotely:
                 lease_s = began_s + LEASE_EVERY_S
                 self._loop.run_in_executor(self._pool, self.acts.lease, self._settings.uploads_mbps)
-            rounds += 1
+            rounds = rounds + 1 if self.viewers.connected else 0
             await asyncio.sleep(max(0.05, began_s + FIGURES_S - time.monotonic()))
 
     async def _send_figures(self, *, with_ledger: bool) -> None:
