@@ -1,4 +1,4 @@
-"""Builds the package for colcon (ament_python) and for pip; the version stands in package.xml as well, a test compares them."""
+"""Builds the package for colcon (ament_python) and for pip. The version is also in package.xml; a test compares them."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ setup(
     ],
     zip_safe=False,
     python_requires='>=3.10',
-    # The same as requirements/runtime.in, which says what each is for.
+    # The same as requirements/runtime.in, which has the reason for each.
     install_requires=[
         'aiohttp>=3.14.4',
         'backports-zstd>=1.0; python_version < "3.14"',

@@ -296,7 +296,7 @@ def _files(found: BagInfo) -> RenderableType:
 
 
 def _qos(profiles: Sequence[Mapping[str, Any]]) -> str:
-    """What decides whether a subscription hears anything; of several publishers each that differs."""
+    """The QoS that decides whether a subscription receives messages; of several publishers each that differs."""
     found: list[str] = []
     for profile in profiles:
         reliability, durability = profile.get('reliability'), profile.get('durability')

@@ -145,7 +145,7 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
         else:  # parts of a small file are read twice
             share = f'all {volume(found.bag_bytes)}'
         yield f'Read {share} in {requests}.'
-    yield from (plain(f'{name} {why}; nothing of it was copied.', 'red') for name, why in found.damaged.items())
+    yield from (plain(f'{name} {why}; none of it was copied.', 'red') for name, why in found.damaged.items())
     yield from [REPAIR] if found.damaged else []
     if found.extras:
         what = 'attachment or metadata record' if found.extras == 1 else 'attachments or metadata records'

@@ -200,7 +200,7 @@ def the_home() -> Path:
 
 
 def the_spool(given: Path | None) -> Path:
-    """The folder that ``--spool`` names, else the one in the home."""
+    """The folder that ``--spool`` names, otherwise the one in the home."""
     return given or the_home() / 'spool'
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 LOGGER_NODES: Final = frozenset({NODE, 'shadowhound_policy'})
 LATCHED_S: Final = 3600.0
-"""What is stored on a change is assumed to change once in so long."""
+"""Assumed period of a topic that is stored on change."""
 
 
 @dataclass(frozen=True, slots=True)

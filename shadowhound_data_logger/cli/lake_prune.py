@@ -99,7 +99,7 @@ def lake_prune(
     with the_store(THREADS) as target, progress() as bar:
         done = library.apply(source, target, made, now_ns=now_ns, findings=left_out, tell=bar.say)
     if as_json:
-        print_json({**_prune_told(made), 'deleted': done.objects, 'deleted_bytes': done.bytes, 'mended': done.resumed})
+        print_json({**_prune_told(made), 'deleted': done.objects, 'deleted_bytes': done.bytes, 'resumed': done.resumed})
     else:
         click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) are deleted.')
         if done.resumed:

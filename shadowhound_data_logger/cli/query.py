@@ -261,7 +261,7 @@ def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool, by: st
 def _verdict(found: Any, shown: int, where: str, *, is_objects: bool) -> str:
     what = 'objects' if is_objects else 'rows'
     if not len(found):
-        return f'No {what} in {where} match the query.{store_hint()}'
+        return f'No {what} in {where} match the query. A node adds rows once per minute.{store_hint()}'
     text = counted(len(found), what[:-1])
     if is_objects:
         text += f', {volume(sum(found["bytes"].to_pylist()))}'

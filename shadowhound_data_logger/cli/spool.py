@@ -264,7 +264,7 @@ def _destination(folder: Path, settings: Settings) -> str:
 
 def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalog: CatalogWriter, patience_s: float,
           bar: ProgressBar) -> None:  # fmt: skip
-    """Until nothing waits that can be delivered, the catalog's parts of it included; or nothing moves for so long."""
+    """Until everything that can be delivered is, including files of the catalog, or nothing was delivered for so many seconds."""
     done, sent, retries, moved_s = -1, 0, 0, time.monotonic()
     while time.monotonic() - moved_s < patience_s:
         is_drained = uploader.drain(LOOK_S)
@@ -278,7 +278,7 @@ def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalog: Catalo
         bar.begin(status.delivered + spool.pending_count())
         bar.say(what, done=status.delivered)
         if not is_drained:
-            time.sleep(LOOK_S)  # it returns at once where the store is away
+            time.sleep(LOOK_S)  # it returns immediately if the store is unreachable
             continue
         parts = catalog.parts()
         for part in parts:

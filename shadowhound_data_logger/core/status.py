@@ -56,7 +56,7 @@ class ClockState:
 
 @dataclass(frozen=True, slots=True)
 class OtherType:
-    """Another type under which the topic is published besides the one that is logged."""
+    """Another type under which the topic is published in addition to the one that is logged."""
 
     publishers: tuple[str, ...] = ()
     """Nodes; some of them if there are many."""
