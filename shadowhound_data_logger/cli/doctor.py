@@ -179,7 +179,8 @@ def report(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], conte
 
 def _verdict(findings: Sequence[Result], context: Context, took_s: float) -> Text:
     """``3 findings: 1 error, 2 warnings``, and the machine."""
-    where = plain(f'  role {context.role.value}, robot {context.settings.robot}, {took_s:.1f} s', 'dim')
+    robot = f'robot {context.settings.robot}' if context.is_named else f'no robot found, checked as {context.settings.robot}'
+    where = plain(f'  role {context.role.value}, {robot}, {took_s:.1f} s', 'dim')
     if not findings:
         return Text.assemble(('Nothing is wrong', 'bold green'), where)
     counts = Counter(result.severity for result in findings)

@@ -36,6 +36,7 @@ def make(
     node = f'/{namespace.strip("/")}/{NODE}' if namespace.strip('/') else None
     given = dict(parameters if parameters is not None else read_parameters(parameter_file, node) if parameter_file else {})
     known, left, refused = dict(environ), dict(given), []
+    is_named = bool(left.get('robot') or namespace.strip('/') or local_robots(environ, home(environ) / 'spool'))
     if not left.get('robot') and not namespace.strip('/'):
         spool = home(environ) / 'spool'
         try:
@@ -63,6 +64,7 @@ def make(
         environ=environ,
         settings=settings,
         refused=tuple(refused),
+        is_named=is_named,
         parameters=given,
         parameter_file=parameter_file,
         namespace=namespace,

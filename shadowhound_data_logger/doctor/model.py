@@ -83,6 +83,8 @@ class Context:
     settings: Settings
     """The node's settings; if some are invalid, those that are left."""
     refused: tuple[SettingError, ...] = ()
+    is_named: bool = True
+    """False if the robot's name is the default of a node: neither given, nor that of a node that has run here."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Flat ROS parameters as given."""
     parameter_file: Path | None = None

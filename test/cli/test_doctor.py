@@ -47,7 +47,7 @@ def run(folder: Path, *arguments: str, **environ: str | None) -> Result:
 def test_findings_come_after_the_verdict(found: list[model.Result], tmp_path: Path) -> None:
     """Errors before warnings, each with the observation, the reason, and a command on one line."""
     found += [FINE, ODD, SAID, BAD]
-    answer = run(tmp_path, '--role', 'robot')
+    answer = run(tmp_path, '--role', 'robot', SHADOWHOUND_ROBOT='thor')
     assert answer.return_value == 1
     lines = [line.rstrip() for line in answer.stdout.splitlines()]
     assert lines[0].startswith('2 findings: 1 error, 1 warning  role robot, robot thor, ')
@@ -65,6 +65,13 @@ def test_without_findings_the_exit_code_is_0(found: list[model.Result], tmp_path
     assert answer.return_value == 0
     assert answer.stdout.startswith('Nothing is wrong')
     assert 'ok some.fine: as it should be' in answer.stdout
+
+
+def test_a_robot_that_is_not_named_is_reported(found: list[model.Result], tmp_path: Path) -> None:
+    """Where no node has run: the name is the one that a node here would have."""
+    found += [FINE]
+    assert 'no robot found, checked as ' in run(tmp_path, '--role', 'robot').stdout
+    assert 'robot tachi' in run(tmp_path, '--role', 'robot', '--namespace', '/tachi').stdout
 
 
 def test_json_is_one_document(found: list[model.Result], tmp_path: Path) -> None:
