@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.verify import verify_folder
 STATIC = '/tf_static'
 
 
-class Told(NamedTuple):
+class Recorded(NamedTuple):
     """A message of a slice, as the `mcap` package reads it."""
 
     topic: str
@@ -31,18 +31,18 @@ class Told(NamedTuple):
     sequence: int
 
 
-def told(path: Path) -> list[Told]:
+def messages_in(path: Path) -> list[Recorded]:
     """In file order."""
     with path.open('rb') as file:
         return [
-            Told(channel.topic, int(message.data[4:12]), channel.metadata.get('shadowhound_repeated') == 'true', message.log_time,
-                 message.publish_time, message.sequence)
+            Recorded(channel.topic, int(message.data[4:12]), channel.metadata.get('shadowhound_repeated') == 'true',
+                     message.log_time, message.publish_time, message.sequence)
             for _, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
         ]  # fmt: skip
 
 
 def repeats(path: Path) -> list[tuple[str, int]]:
-    return [(each.topic, each.number) for each in told(path) if each.repeated]
+    return [(each.topic, each.number) for each in messages_in(path) if each.repeated]
 
 
 def slices(it: Desk, bag: str) -> list[Path]:
@@ -67,11 +67,11 @@ def test_each_slice_begins_with_what_is_latched(tmp_path: Path) -> None:
         assert repeats(first) == []
         assert repeats(second) == repeats(third) == [(STATIC, 2), (STATIC, 5)]
         (received,) = messages(range(2, 3))
-        early = [each for each in told(second) if each.repeated]
+        early = [each for each in messages_in(second) if each.repeated]
         began_ns = messages(range(20, 21))[0].received_ns
         assert (early[0].publish_ns, early[0].sequence) == (received.source_ns, 2)
         assert {each.log_ns for each in early} == {began_ns - REPEAT_LEAD_NS}
-        assert min(each.log_ns for each in told(second) if not each.repeated) == began_ns
+        assert min(each.log_ns for each in messages_in(second) if not each.repeated) == began_ns
 
 
 def test_a_slice_is_played_on_its_own(tmp_path: Path) -> None:
@@ -137,7 +137,9 @@ def test_after_a_crash_repeats_are_not_received_either(tmp_path: Path, *, is_los
             path.unlink()
     with desk(killed) as it:
         it.recorder._recovery.worker.join(60)
-        assert [(each.topic, each.repeated) for each in told(slices(it, bag)[1])] == [(STATIC, True)] + [('/talk', False)] * 10
+        assert [(each.topic, each.repeated) for each in messages_in(slices(it, bag)[1])] == [(STATIC, True)] + [
+            ('/talk', False)
+        ] * 10
         rows = {topic: it.row(topic) for topic in (STATIC, '/talk')}
         assert [(row['received'], row['stored'], row['open']) for row in rows.values()] == [(1, 1, 0), (20, 20, 0)]
         written = manifest(it.objects(), bag)
@@ -175,7 +177,7 @@ def test_messages_latched_during_a_pause_are_in_later_slices(tmp_path: Path) -> 
         it.hear(range(10, 20))
         it.recorder.stop()
         first, second = slices(it, bag)
-        assert [each.number for each in told(first)] == [1]
+        assert [each.number for each in messages_in(first)] == [1]
         assert repeats(second) == [(STATIC, 2)]
         assert it.row(STATIC)['dropped'] == {}
 

@@ -17,10 +17,10 @@ KEEP_S = 10.0
 def kept(ring: Ring) -> list[int]:
     """The numbers of the messages in it, oldest first; it is empty afterwards."""
     ring.claim(float('-inf'))
-    return [number for held in iter(lambda: ring.next(float('inf')), None) for number in told(held)]
+    return [number for held in iter(lambda: ring.next(float('inf')), None) for number in numbers_of(held)]
 
 
-def told(held: RingItem) -> list[int]:
+def numbers_of(held: RingItem) -> list[int]:
     return [message.number for message in held.batch.messages if message.number is not None]
 
 
@@ -49,7 +49,7 @@ def test_a_large_claim_is_written_in_pieces() -> None:
     ring.put(batch(range(10), size=PIECE_BYTES // 2), {'transport': 3}, 0.0)
     ring.claim(0.0)
     pieces = list(iter(lambda: ring.next(0.0), None))
-    assert [told(piece) for piece in pieces] == [[number] for number in range(10)]
+    assert [numbers_of(piece) for piece in pieces] == [[number] for number in range(10)]
     assert [piece.lost for piece in pieces] == [{}] * 9 + [{'transport': 3}]
 
 
@@ -80,10 +80,10 @@ def test_claimed_messages_do_not_expire() -> None:
     assert ring.claimed
     assert ring.put(batch(range(3, 6)), None, 100.0) == []
     gone = ring.put(batch(range(6, 8)), None, 101.0)
-    assert [told(held) for held in gone] == [[1], [2]]
+    assert [numbers_of(held) for held in gone] == [[1], [2]]
     held = ring.next(100.0)
     assert held is not None
-    assert told(held) == [3, 4, 5]
+    assert numbers_of(held) == [3, 4, 5]
     assert ring.next(100.0) is None
     ring.release()
     assert ring.put(batch(range(8, 9)), None, 120.0) == []
@@ -133,7 +133,7 @@ def latched(*numbers: int, publisher: str | None = 'p', size: int = 0, publisher
 def of_event(ring: Ring) -> list[tuple[str, str | None, list[int], bool]]:
     """The contents of an event: topic, publisher, numbers, and whether a message is repeated."""
     found = list(iter(lambda: ring.next(float('inf')), None))
-    return [(held.batch.topic, held.batch.messages[0].publisher, told(held), held.repeated) for held in found]
+    return [(held.batch.topic, held.batch.messages[0].publisher, numbers_of(held), held.repeated) for held in found]
 
 
 def test_latched_messages_are_at_the_start_of_each_event() -> None:

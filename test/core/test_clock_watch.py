@@ -87,20 +87,20 @@ def test_each_change_is_logged_once(clocks: Clocks, caplog: pytest.LogCaptureFix
     caplog.set_level(logging.INFO)
     watch = ClockWatch(clocks, 600.0, steps=4)
 
-    def said(seconds: float) -> list[str]:
+    def warnings_after(seconds: float) -> list[str]:
         caplog.clear()
         clocks.wait(seconds)
         for _ in range(3):
             watch.poll()
         return [record.getMessage().split(';')[0].split(':')[0] for record in caplog.records]
 
-    assert said(0) == ['the clock of this machine is not set']
-    assert said(601) == ['the clock was not set for 601 s']
+    assert warnings_after(0) == ['the clock of this machine is not set']
+    assert warnings_after(601) == ['the clock was not set for 601 s']
     clocks.set()
-    assert said(0) == ['the clock was set']
+    assert warnings_after(0) == ['the clock was set']
     clocks.offset_ns -= 5 * SECOND
-    assert said(0) == ['the clock stepped by -5.000 s']
-    assert said(10) == []
+    assert warnings_after(0) == ['the clock stepped by -5.000 s']
+    assert warnings_after(10) == []
     assert watch.state().steps == 6
 
 

@@ -212,19 +212,19 @@ def test_a_dataset_edited_with_lerobot_keeps_its_episodes(tmp_path: Path) -> Non
     store = DirectoryStore(house.settings.directory)
     begins = [Mission('', begin_s=100.0 * number).begin_ns for number in range(3)]
 
-    def brought(name: str, *recordings: int) -> tuple[Imported, tuple[int, int, int, int]]:
+    def imported(name: str, *recordings: int) -> tuple[Imported, tuple[int, int, int, int]]:
         times = {episode: begins[recording] for episode, recording in enumerate(recordings)}
         found = import_episodes(read_lerobot(tmp_path / 'arm' / name, times, is_degrees=False), 'arm', store)
         return found, (found.episodes, found.unchanged, len(found.refused), len(found.absent))
 
-    assert brought('two', 0, 1)[1] == (2, 0, 0, 0)
-    assert brought('grown', 0, 1, 2)[1] == (1, 2, 0, 0)
+    assert imported('two', 0, 1)[1] == (2, 0, 0, 0)
+    assert imported('grown', 0, 1, 2)[1] == (1, 2, 0, 0)
     for name in ('grown', 'tasks', 'stats', 'encoded'):
-        assert brought(name, 0, 1, 2)[1] == (0, 3, 0, 0), name
-    assert brought('deleted', 0, 2)[1] == (0, 2, 0, 1)
-    assert brought('split/first', 0)[1] == (0, 1, 0, 2)
-    assert brought('split/others', 1, 2)[1] == (0, 2, 0, 1)
-    assert brought('merged', 1, 2, 0)[1] == (0, 3, 0, 0)
-    assert brought('merged', 0, 1, 2)[1] == (0, 0, 3, 0)
+        assert imported(name, 0, 1, 2)[1] == (0, 3, 0, 0), name
+    assert imported('deleted', 0, 2)[1] == (0, 2, 0, 1)
+    assert imported('split/first', 0)[1] == (0, 1, 0, 2)
+    assert imported('split/others', 1, 2)[1] == (0, 2, 0, 1)
+    assert imported('merged', 1, 2, 0)[1] == (0, 3, 0, 0)
+    assert imported('merged', 0, 1, 2)[1] == (0, 0, 3, 0)
     late = {0: begins[0] + SECOND // 2}
     assert len(import_episodes(read_lerobot(tmp_path / 'arm/split/first', late, is_degrees=False), 'arm', store).refused) == 1

@@ -99,7 +99,7 @@ def of(mission: str) -> MissionOf:
     return MissionOf('patrol', mission, f'run{mission}')
 
 
-def told(found: Exported, mission: str, stream: str = 'images.front') -> dict[str, Any]:
+def stream_of(found: Exported, mission: str, stream: str = 'images.front') -> dict[str, Any]:
     (mine,) = [each for each in found.added if each['mission_id'] == mission]
     return dict(mine['streams'][stream])
 
@@ -113,8 +113,8 @@ def test_missions_that_are_four_seconds_apart_are_separate(yard: Yard) -> None:
     assert (found.refused, found.waiting, found.fps) == ({}, {}, 10)
     for mission, prefix in bags.items():
         assert list(yard.sources(mission)) == [f'{prefix}{prefix.split("/")[2]}_0.mcap']
-    assert told(found, 'two')['messages'] == 41
-    assert told(found, 'two')['rate_hz'] == pytest.approx(10, rel=0.05)
+    assert stream_of(found, 'two')['messages'] == 41
+    assert stream_of(found, 'two')['rate_hz'] == pytest.approx(10, rel=0.05)
     assert verify(yard.folder / 'set', DirectoryStore(yard.settings.directory), frames=None).wrong == []
 
 
@@ -125,7 +125,7 @@ def test_the_missions_bag_takes_precedence_over_another_one(yard: Yard) -> None:
     yard.bag('always', (0, 40), hz=40)
     yard.bag('another', (19, 25), hz=40, mission=of('zero'))
     yard.bag('event', (0, 25), hz=40, mission=of('one'), event=EVENT)
-    assert told(yard.export(), 'one')['from'] == 'bags'
+    assert stream_of(yard.export(), 'one')['from'] == 'bags'
     assert list(yard.sources('one')) == list(yard.sources('one', 'state.pose')) == [f'{own}own_0.mcap']
 
 
@@ -147,7 +147,7 @@ def test_each_mission_gets_its_slices_of_a_shared_bag(yard: Yard) -> None:
     assert (found.refused, found.fps) == ({}, 10)
     for mission, slices in (('one', (0, 1)), ('two', (2, 3))):
         assert list(yard.sources(mission)) == [f'{prefix}service_{number}.mcap' for number in slices]
-        assert told(found, mission)['from'] == 'bags'
+        assert stream_of(found, mission)['from'] == 'bags'
 
 
 def test_a_mission_without_a_bag_uses_the_bag_of_its_neighbor_where_it_has_more(yard: Yard) -> None:
@@ -156,7 +156,7 @@ def test_a_mission_without_a_bag_uses_the_bag_of_its_neighbor_where_it_has_more(
     yard.mission('two', 5)
     yard.bag('b1', (0, 6), hz=40, mission=of('one'))
     found = yard.export()
-    assert (told(found, 'one')['from'], told(found, 'two')['from']) == ('bags', 'objects')
+    assert (stream_of(found, 'one')['from'], stream_of(found, 'two')['from']) == ('bags', 'objects')
     assert found.refused == {}
     assert all('/camera/' in key for key in yard.sources('two'))
 
@@ -168,7 +168,7 @@ def test_an_excerpt_does_not_represent_a_mission(yard: Yard) -> None:
     yard.bag('event', (18, 24), hz=40, mission=of('one'), event=EVENT)
     yard.bag('part', (61, 63.5), hz=40, mission=of('two'))
     found = yard.export()
-    assert {told(found, each)['from'] for each in ('one', 'two')} == {'objects'}
+    assert {stream_of(found, each)['from'] for each in ('one', 'two')} == {'objects'}
     assert found.refused == {}
 
 
@@ -179,8 +179,8 @@ def test_a_mission_may_be_in_two_bags(yard: Yard) -> None:
     found = yard.export(max_stale=0.5)
     assert found.refused == {}
     assert list(yard.sources('one')) == [f'{parts[0]}first_0.mcap', f'{parts[1]}then_0.mcap']
-    assert told(found, 'one')['messages'] == 41 + 31
-    assert told(found, 'one')['longest_gap_s'] == pytest.approx(0.9, abs=0.06)
+    assert stream_of(found, 'one')['messages'] == 41 + 31
+    assert stream_of(found, 'one')['longest_gap_s'] == pytest.approx(0.9, abs=0.06)
 
 
 def test_the_last_moment_of_a_mission_is_in_another_bag(yard: Yard) -> None:
@@ -205,7 +205,7 @@ def test_an_always_on_bag_has_the_beginning(yard: Yard) -> None:
     assert max(sources['thor/rosbags/always/always_0.mcap']) < min(sources[f'{own}own_0.mcap']) == NOON_NS + 12 * SECOND
     stamps = np.array(sorted(stamp for some in sources.values() for stamp in some))
     assert set(np.diff(stamps)) == {SECOND // 10}
-    assert told(found, 'one')['stale_share'] == 0
+    assert stream_of(found, 'one')['stale_share'] == 0
 
 
 def test_two_bags_of_no_mission_have_each_message_once(yard: Yard) -> None:
@@ -215,7 +215,7 @@ def test_two_bags_of_no_mission_have_each_message_once(yard: Yard) -> None:
     yard.bag('that', (6, 19))
     found = yard.export()
     assert list(yard.sources('one')) == ['thor/rosbags/that/that_0.mcap']
-    assert told(found, 'one')['messages'] == len(range(6 * 10, 14 * 10 + 1))
+    assert stream_of(found, 'one')['messages'] == len(range(6 * 10, 14 * 10 + 1))
 
 
 @pytest.mark.parametrize('damage', [lambda _: None, lambda path: path.write_bytes(b'{"version": 1}')], ids=['none', 'damaged'])
@@ -225,7 +225,7 @@ def test_a_bag_without_a_manifest_is_not_used(yard: Yard, damage: Callable[[Path
     prefix = yard.bag('foreign', (9, 15), hz=40, has_manifest=False)
     damage(yard.settings.directory / 'sensor-data' / prefix / 'manifest.json')
     found = yard.export()
-    assert (told(found, 'one')['from'], found.refused) == ('objects', {})
+    assert (stream_of(found, 'one')['from'], found.refused) == ('objects', {})
 
 
 def test_objects_from_before_a_mission_do_not_count(yard: Yard) -> None:
@@ -236,7 +236,7 @@ def test_objects_from_before_a_mission_do_not_count(yard: Yard) -> None:
     yard.mission('one', 30)
     found = yard.export()
     assert found.refused == {}
-    assert told(found, 'one')['topic'] == TOPICS['camera']
+    assert stream_of(found, 'one')['topic'] == TOPICS['camera']
 
 
 def test_objects_are_used_where_they_have_more_of_the_mission(yard: Yard) -> None:
@@ -244,7 +244,7 @@ def test_objects_are_used_where_they_have_more_of_the_mission(yard: Yard) -> Non
     yard.mission('one', 20, camera_hz=20.0, odom_hz=20.0)
     yard.bag('own', (10, 19.5), (20, 24), hz=15, mission=of('one'))
     found = yard.export()
-    assert told(found, 'one')['from'] == 'objects'
+    assert stream_of(found, 'one')['from'] == 'objects'
     assert found.fps == 20
 
 

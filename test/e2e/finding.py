@@ -45,12 +45,12 @@ def listen(cases: Sequence[Mapping[str, str]]) -> None:
         for topic in TOPICS:
             driver.obey({'do': 'listen', 'topic': topic, 'type': STRING, 'reliable': True, 'latched': False, 'depth': 10})
 
-    def heard() -> list[list[str]]:
+    def topics_received() -> list[list[str]]:
         for driver in drivers:
             driver.poll()
         return [[topic for topic in TOPICS if driver.obey({'do': 'count', 'topic': topic})] for driver in drivers]
 
-    answer(heard)
+    answer(topics_received)
 
 
 def find(case: Mapping[str, str]) -> None:
@@ -71,21 +71,21 @@ def find(case: Mapping[str, str]) -> None:
     readers = {topic: node.create_subscription(String, topic, print, 10) for topic in TOPICS}
     found: set[str] = set()
 
-    def heard() -> list[str]:
+    def topics_received() -> list[str]:
         for topic, reader in readers.items():
             with reader.handle:
                 if reader.handle.take_message(String, True) is not None:
                     found.add(topic)
         return sorted(found)
 
-    answer(heard)
+    answer(topics_received)
 
 
-def answer(heard: Callable[[], object]) -> None:
+def answer(topics_received: Callable[[], object]) -> None:
     """Respond until the end of standard input."""
     say('ready')
     for _ in sys.stdin:
-        say(json.dumps(heard()))
+        say(json.dumps(topics_received()))
 
 
 def say(line: str) -> None:

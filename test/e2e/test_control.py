@@ -222,13 +222,13 @@ def test_the_status_file_matches_the_ledger(operated: Operated) -> None:
     operated.station.flush()
     rows = node.ledger()['topics']
 
-    def told() -> bool:
+    def is_reported() -> bool:
         found = status.read(node.home / 'spool', node.robot, clock)
         assert found.running
         return all(found.node.topics[name].stored == row['stored'] and not found.node.topics[name].open
                    and found.node.topics[name].missed == row['missed'] for name, row in rows.items())  # fmt: skip
 
-    until(told, 'the status is that of the ledger')
+    until(is_reported, 'the status is that of the ledger')
 
 
 # -- several robots ----------------------------------------------------------------------------------------------------

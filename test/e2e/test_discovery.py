@@ -77,7 +77,7 @@ def ready(process: subprocess.Popen[str]) -> subprocess.Popen[str]:
     return process
 
 
-def heard(process: subprocess.Popen[str]) -> Any:
+def received_by(process: subprocess.Popen[str]) -> Any:
     """What it has received so far."""
     assert process.stdin is not None
     assert process.stdout is not None
@@ -107,7 +107,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, tuple[
         expected = [case[2] for case in CASES.values()]
         end, settled_s = time.monotonic() + WAIT_S, 0.0
         while time.monotonic() < end:
-            by_cyclone, by_us = heard(reader), [heard(finder) for finder in finders]
+            by_cyclone, by_us = received_by(reader), [received_by(finder) for finder in finders]
             is_whole = all(set(names) <= set(ours) for names, ours in zip(expected, by_us, strict=True))
             settled_s = settled_s or (time.monotonic() if is_whole else 0.0)
             if settled_s and time.monotonic() > settled_s + MORE_S:

@@ -36,7 +36,7 @@ def total(node: Node, what: str) -> int:
     return sum(sum(row[what].values()) if isinstance(row[what], dict) else row[what] for row in rows)
 
 
-def heard(station: Station) -> list[dict[str, Any]]:
+def published_missions(station: Station) -> list[dict[str, Any]]:
     """What ``~/mission`` publishes, for a late subscriber."""
     found: list[str] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -68,16 +68,16 @@ def test_only_mission_data_is_stored(
     try:
         until(lambda: node.topic('/imu').get('received', 0) > ENOUGH, "the robot's messages are received")
         assert total(node, 'stored') == 0
-        assert heard(station) == [{}]
+        assert published_missions(station) == [{}]
         mission_id = logger.start_mission('patrol', 'go round')
         (folder,) = missions(node.home)
         until(folder.node.journal.exists, 'the node joins in')
         until(lambda: sees(folder), lambda: f'the node logs the robot: {state_of(folder).node}')
-        assert heard(station)[-1]['mission_id'] == mission_id
+        assert published_missions(station)[-1]['mission_id'] == mission_id
         logger.end_mission(True, 0.0, 0.0)
         logger.flush(0.0)
         until(lambda: not journal.is_locked(folder.node.journal), 'the node leaves')
-        until(lambda: heard(station) == [{}], 'the end of the mission is published')
+        until(lambda: published_missions(station) == [{}], 'the end of the mission is published')
         node.received('/imu', node.topic('/imu')['received'] + ENOUGH)
         until(lambda: not node.ledger()['objects']['pending'] and not total(node, 'open'), 'all is delivered')
         count = total(node, 'stored')

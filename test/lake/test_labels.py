@@ -36,7 +36,7 @@ def lake(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
     return Bucket(settings, 'sensor-data')
 
 
-def said(lake: Bucket, *found: Label, is_removal: bool = False) -> str:
+def write_labels(lake: Bucket, *found: Label, is_removal: bool = False) -> str:
     with closing(open_store(lake.settings, UploadSettings())) as store:
         return labels.write(store, found[0].robot, found, by='ann', is_removal=is_removal)
 
@@ -47,13 +47,13 @@ def names(lake: Bucket) -> list[str]:
 
 def test_a_removal_is_a_layer_and_a_label_may_come_back(lake: Bucket, tmp_path: Path) -> None:
     """The newest row about a label counts; layers stay, with author and time."""
-    first = said(lake, STAIRS)
-    said(lake, STAIRS)
+    first = write_labels(lake, STAIRS)
+    write_labels(lake, STAIRS)
     (one,) = labels.read(lake, 'thor')
     assert (one.label, one.note, one.by, one.id) == ('stairs', 'the cellar', 'ann', STAIRS.checked().id)
-    said(lake, one, is_removal=True)
+    write_labels(lake, one, is_removal=True)
     assert names(lake) == []
-    said(lake, STAIRS)
+    write_labels(lake, STAIRS)
     assert names(lake) == ['stairs']
     assert lake.head(first) is not None
     files = f'{lake.settings.directory}/sensor-data/thor/_labels/*/*.jsonl.zst'
@@ -68,11 +68,11 @@ def test_a_removal_is_a_layer_and_a_label_may_come_back(lake: Bucket, tmp_path: 
 
 def test_labels_choose_objects(lake: Bucket) -> None:
     """A label of a time selects everything that overlaps it, one of an object only that; with other flags, and in SQL."""
-    said(lake, STAIRS)
+    write_labels(lake, STAIRS)
     boxes = [BOX, replace(BOX, key='thor/camera/none.jpg')]
     kept, absent = labels.with_times(lake, boxes, Findings())
     assert absent == ['thor/camera/none.jpg']
-    said(lake, *kept)
+    write_labels(lake, *kept)
     found = query.objects(lake, label='stairs', sensor='camera').to_pydict()
     assert [(each - NOON_NS) // SECOND for each in sorted(found['t_start_ns'])] == [0, 15]
     assert query.objects(lake, label='person').to_pydict()['key'] == [PICTURE]
@@ -89,12 +89,12 @@ def test_labels_choose_objects(lake: Bucket) -> None:
 
 def test_samples_have_labels(lake: Bucket) -> None:
     """The labels at the time of the call, also in a dataset that was pickled."""
-    said(lake, STAIRS)
+    write_labels(lake, STAIRS)
     dataset = MissionDataset(lake, since='2026-10-28T11:59:50', until='2026-10-28T12:01')
     found = [(stamp - NOON_NS) // SECOND for stamp, names in zip(dataset.stamps_ns, dataset.labels(), strict=True) if names]
     assert found == [0, 15]
     assert [(stamp - NOON_NS) // SECOND for stamp in MissionDataset(lake, label='stairs').stamps_ns] == [0, 15]
-    said(lake, STAIRS, is_removal=True)
+    write_labels(lake, STAIRS, is_removal=True)
     assert not any(pickle.loads(pickle.dumps(dataset)).labels())  # noqa: S301 - our own
 
 

@@ -52,12 +52,12 @@ def body(begin_ns: int, messages: list[dict[str, Any]]) -> bytes:
     return orjson.dumps({'robot': 'thor', 'sensor': 's', 'count': len(samples), 'samples': samples})
 
 
-def filled(root: Path, batches: list[list[dict[str, Any]]], told: list[bool], chosen: tuple[str, ...] = ()) -> Bucket:
+def filled(root: Path, batches: list[list[dict[str, Any]]], with_statistics: list[bool], chosen: tuple[str, ...] = ()) -> Bucket:
     """A lake with a batch every minute; ``told`` selects those with statistics."""
     store_settings = folder_store(root)
     with closing(open_store(store_settings, UploadSettings())) as store:
         rows, statistics = [], []
-        for number, (messages, is_told) in enumerate(zip(batches, told, strict=True)):
+        for number, (messages, is_told) in enumerate(zip(batches, with_statistics, strict=True)):
             begin_ns = NOON_NS + number * 60 * SECOND
             content = body(begin_ns, messages)
             key = f'thor/s/20261028/{number:06d}_s.json'
@@ -311,11 +311,11 @@ def test_only_questions_about_values_read_statistics(tmp_path: Path, monkeypatch
     for name in ('list', 'get', 'ranges', 'folders'):
         call = getattr(Bucket, name)
 
-        def told(of: Bucket, key: str, *more: Any, call: Any = call) -> Any:
+        def count_call(of: Bucket, key: str, *more: Any, call: Any = call) -> Any:
             asked.append(key)
             return call(of, key, *more)
 
-        monkeypatch.setattr(Bucket, name, told)
+        monkeypatch.setattr(Bucket, name, count_call)
     assert len(query.objects(source, sensor='s').to_pydict()['key']) == 10
     assert (len(asked) > 0, [key for key in asked if '_stats' in key]) == (True, [])
     values.ranges('s.a > 11', source)

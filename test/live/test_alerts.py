@@ -54,7 +54,7 @@ class Webhook:
         return web.Response(status=self.status, headers={'Location': '/elsewhere'})
 
     @property
-    def said(self) -> list[tuple[str, str, str]]:
+    def notices(self) -> list[tuple[str, str, str]]:
         return [(each['robot'], each['condition'], each['state']) for each in self.got]
 
 
@@ -100,16 +100,16 @@ def test_a_condition_is_reported_once_when_it_begins_and_once_when_it_ends(tmp_p
         async with webhook() as (hook, url):
             checked = Checked(url, tmp_path)
             await checked.look(is_on=False)
-            assert hook.said == []
+            assert hook.notices == []
             for is_on in (True, True, None, True):
                 await checked.look(is_on=is_on, after_s=60)
-            assert hook.said == [('thor', 'disk', 'begins')]
+            assert hook.notices == [('thor', 'disk', 'begins')]
             checked.restart()
             await checked.look(is_on=True, after_s=2 * AGAIN_S)
             assert len(hook.got) == 1
             for is_on in (False, False):
                 await checked.look(is_on=is_on)
-            assert hook.said == [('thor', 'disk', 'begins'), ('thor', 'disk', 'ended')]
+            assert hook.notices == [('thor', 'disk', 'begins'), ('thor', 'disk', 'ended')]
             assert hook.got[0]['title'] == 'thor: disk'
             assert hook.got[0]['text'] == 'the disk is full'
             assert hook.got[1]['text'] == 'No longer: the disk is full.'
@@ -130,15 +130,15 @@ def test_a_condition_that_comes_and_goes_is_reported_once_an_hour(tmp_path: Path
             for _ in range(3):
                 await checked.look(is_on=True, after_s=300)
                 await checked.look(is_on=False, after_s=300)
-            assert [state for _, _, state in hook.said] == ['begins', 'ended']
+            assert [state for _, _, state in hook.notices] == ['begins', 'ended']
             checked.restart()
             await checked.look(is_on=True, after_s=60)
             assert len(hook.got) == 2
             await checked.look(is_on=True, after_s=AGAIN_S)
-            assert [state for _, _, state in hook.said] == ['begins', 'ended', 'begins']
+            assert [state for _, _, state in hook.notices] == ['begins', 'ended', 'begins']
             checked.found.append(Condition('thor', 'silent', True, 'it is silent'))
             await checked.look(is_on=True)
-            assert hook.said[-1] == ('thor', 'silent', 'begins')
+            assert hook.notices[-1] == ('thor', 'silent', 'begins')
 
     asyncio.run(run())
 
@@ -157,7 +157,7 @@ def test_what_could_not_be_sent_is_sent_after_the_next_check(
                 await checked.look(is_on=True, after_s=120)
             hook.status = 200
             await checked.look(is_on=True, after_s=120)
-            assert hook.said == [('thor', 'disk', 'begins')]
+            assert hook.notices == [('thor', 'disk', 'begins')]
 
     with caplog.at_level(logging.DEBUG, logger=module.__name__):
         asyncio.run(run())
@@ -280,7 +280,7 @@ def test_the_page_of_a_store_sends_alerts(tmp_path: Path, monkeypatch: pytest.Mo
             del page
             while not hook.got:
                 await asyncio.sleep(0.05)
-            assert set(hook.said) <= {(name, 'silent', 'begins') for name in ('thor', 'loki', 'odin')}
+            assert set(hook.notices) <= {(name, 'silent', 'begins') for name in ('thor', 'loki', 'odin')}
 
     asyncio.run(asyncio.wait_for(run(), 100))
 
@@ -292,6 +292,6 @@ def test_the_page_of_a_robot_sends_alerts(tmp_path: Path, monkeypatch: pytest.Mo
         async with webhook() as (hook, url), serving(tmp_path, monkeypatch, alerts=AlertSettings(url=url)):
             while not hook.got:
                 await asyncio.sleep(0.05)
-            assert hook.said == [('thor', 'silent', 'begins')]
+            assert hook.notices == [('thor', 'silent', 'begins')]
 
     asyncio.run(asyncio.wait_for(run(), 100))

@@ -63,7 +63,7 @@ def items(body: bytes) -> dict[str, tuple[dict[str, Any], bytes]]:
     return found
 
 
-def told(at_s: float, sensor: str, topic: str, kind: str, extension: str, **more: str) -> Row:
+def object_row(at_s: float, sensor: str, topic: str, kind: str, extension: str, **more: str) -> Row:
     """The row of an object this many seconds after noon."""
     at_ns = NOON_NS + round(at_s * SECOND)
     metadata = {'robot': 'thor', 'sensor': sensor, 'topic': topic, 'type': kind, 'count': '1', 't_start_ns': str(at_ns),
@@ -105,7 +105,7 @@ def patrol(store: ObjectStore, folder: Path) -> None:
             ('camera', '/camera', COMPRESSED_IMAGE, 'jpg', jpeg(20 * second)),
             ('odom', '/odom', ODOMETRY, 'json', odometry(second)),
         ):
-            rows.append(told(second, sensor, topic, kind, extension, mission_id='m1', mission_type='patrol'))
+            rows.append(object_row(second, sensor, topic, kind, extension, mission_id='m1', mission_type='patrol'))
             rows[-1]['bytes'] = len(body)
             add(store, folder / 'tmp', rows[-1]['key'], body)
     add_part(store, rows, 'a', folder / 'tmp')
@@ -120,7 +120,7 @@ def late_patrol(store: ObjectStore, folder: Path) -> None:
     for second in range(10):
         received = str(NOON_NS + (second + LATE_S) * SECOND)
         rows.append(
-            told(second, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg', received_start_ns=received, received_end_ns=received)
+            object_row(second, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg', received_start_ns=received, received_end_ns=received)
         )
         add(store, folder / 'tmp', rows[-1]['key'], jpeg(20 * second))
     add_part(store, [*rows, *bag(store, folder, 'late', 'bump', late_s=LATE_S)], 'a', folder / 'tmp')
@@ -205,7 +205,7 @@ def test_messages_of_a_batch_are_shown_when_they_arrived(store: ObjectStore, ope
             sample['position']['x'] = begin_s + number
         start, end = (str(NOON_NS + round(at_s * SECOND)) for at_s in arrival)
         ends = str(NOON_NS + stamps_s[-1] * SECOND)
-        rows.append(told(begin_s, 'odom', '/odom', ODOMETRY, 'json', count='5', t_end_ns=ends, received_start_ns=start,
+        rows.append(object_row(begin_s, 'odom', '/odom', ODOMETRY, 'json', count='5', t_end_ns=ends, received_start_ns=start,
                          received_end_ns=end))  # fmt: skip
         add(store, tmp_path / 'tmp', rows[-1]['key'], json.dumps({'type': ODOMETRY, 'samples': samples}).encode())
     add_part(store, rows, 'a', tmp_path / 'tmp')
@@ -351,10 +351,10 @@ def test_a_hostile_store_is_answered_without_what_is_wrong(store: ObjectStore, o
     (tmp_path / 'secret.jpg').write_bytes(jpeg(7))
     joints, points = 'sensor_msgs/msg/JointState', 'sensor_msgs/msg/PointCloud2'
     rows = [
-        told(5.2, 'camera', '/climbs', COMPRESSED_IMAGE, 'jpg'), told(5.2, 'odom', '/no-json', ODOMETRY, 'json'),
-        told(5.2, 'camera', '/bomb', COMPRESSED_IMAGE, 'jpg'), told(5.2, 'odom', '/deep', ODOMETRY, 'json'),
-        told(5.2, 'x', HOSTILE, HOSTILE, 'jpg', mission_id=HOSTILE), told(5.2, 'joints', '/names', joints, 'json'),
-        told(5.2, 'lidar', '/cloud', points, 'pcd'),
+        object_row(5.2, 'camera', '/climbs', COMPRESSED_IMAGE, 'jpg'), object_row(5.2, 'odom', '/no-json', ODOMETRY, 'json'),
+        object_row(5.2, 'camera', '/bomb', COMPRESSED_IMAGE, 'jpg'), object_row(5.2, 'odom', '/deep', ODOMETRY, 'json'),
+        object_row(5.2, 'x', HOSTILE, HOSTILE, 'jpg', mission_id=HOSTILE), object_row(5.2, 'joints', '/names', joints, 'json'),
+        object_row(5.2, 'lidar', '/cloud', points, 'pcd'),
     ]  # fmt: skip
     for place, row in enumerate(rows):
         row['key'] = f'thor/hostile/{place}.{row["key"].rpartition(".")[2]}'
@@ -642,7 +642,7 @@ def test_the_command_pulls_kept_data(store: ObjectStore, opened: Opened, tmp_pat
 
 def test_a_plot_keeps_its_range_where_a_bag_covers_the_moment(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
     """Earlier data from objects is in the same series as the data read from the bag."""
-    rows = [told(second, 'imu', '/imu', IMU, 'json') for second in range(12, 21)]
+    rows = [object_row(second, 'imu', '/imu', IMU, 'json') for second in range(12, 21)]
     vector, turn = {'x': 1.0, 'y': 2.0, 'z': 3.0}, {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
     for second, row in zip(range(12, 21), rows, strict=True):
         unknown = {f'{each}_covariance': [0.0] * 9 for each in ('orientation', 'angular_velocity', 'linear_acceleration')}

@@ -81,7 +81,7 @@ def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypat
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path / 'elsewhere'))
     monkeypatch.setenv('SHADOWHOUND_ROBOT', 'another')
 
-    async def told(spool: Path) -> dict[str, Any]:
+    async def doctor_answer(spool: Path) -> dict[str, Any]:
         server = LiveServer(LiveSettings(spool=spool, robot='thor', tokens=tmp_path / 'live', port=0))
         await server.open()
         try:
@@ -91,10 +91,10 @@ def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypat
         finally:
             await server.close()
 
-    found = asyncio.run(told(tmp_path / 'home' / 'spool'))
+    found = asyncio.run(doctor_answer(tmp_path / 'home' / 'spool'))
     assert found['doctor']['asked'].endswith('doctor --json')
     assert (found['doctor']['home'], found['doctor']['robot']) == (str(tmp_path / 'home'), 'thor')
-    assert 'has its spool in SHADOWHOUND_HOME/spool' in asyncio.run(told(tmp_path / 'copy'))['error']
+    assert 'has its spool in SHADOWHOUND_HOME/spool' in asyncio.run(doctor_answer(tmp_path / 'copy'))['error']
 
 
 def test_viewers_on_other_machines_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -126,20 +126,20 @@ def test_every_verb_has_the_agents_spelling(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.chdir(tmp_path)
 
-    def told(*arguments: str, code: int = 0) -> Any:
+    def json_of(*arguments: str, code: int = 0) -> Any:
         done = CliRunner().invoke(cli, [*arguments, '--json'], standalone_mode=False)
         assert (done.exception, done.return_value) == (None, code), done.output
         return json.loads(done.stdout)
 
-    assert {each['type']: each['mission_id'] for each in told('missions', 'list')} == ids
-    assert {told('missions', 'show', mission_id)['type'] for mission_id in ids.values()} == {*SEEN}
-    counts = told('query', 'SELECT mission_type, count(*) AS n FROM missions GROUP BY mission_type')
+    assert {each['type']: each['mission_id'] for each in json_of('missions', 'list')} == ids
+    assert {json_of('missions', 'show', mission_id)['type'] for mission_id in ids.values()} == {*SEEN}
+    counts = json_of('query', 'SELECT mission_type, count(*) AS n FROM missions GROUP BY mission_type')
     assert {row['mission_type']: row['n'] for row in counts} == dict.fromkeys(SEEN, 1)
-    told('lake', 'index')
+    json_of('lake', 'index')
     for given, mission_id in ids.items():
-        assert {row['mission_id'] for row in told('query', '--mission-type', given)} == {mission_id}
-        assert [each['mission_id'] for each in told('search', 'door', '--mission-type', given)['found']] == [mission_id]
-        chosen = told('export', 'lerobot', 'set', '--mission-type', given, '--dry-run', code=1)
+        assert {row['mission_id'] for row in json_of('query', '--mission-type', given)} == {mission_id}
+        assert [each['mission_id'] for each in json_of('search', 'door', '--mission-type', given)['found']] == [mission_id]
+        chosen = json_of('export', 'lerobot', 'set', '--mission-type', given, '--dry-run', code=1)
         assert [*chosen['refused']] == [mission_id], 'it is chosen, and has no camera'
     for verb in (('query',), ('search', 'door'), ('export', 'lerobot', 'x', '--dry-run'), ('fetch', '--to', 'x')):
         done = CliRunner().invoke(cli, [*verb, '--mission-type', 'night_patrol'], standalone_mode=False)

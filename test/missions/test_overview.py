@@ -38,7 +38,7 @@ def new(folder: MissionFolder, **options: object) -> Delivery:
     return Delivery(folder, FakeTracking(), FakeSpooler(), **options)  # type: ignore[arg-type]
 
 
-def said(folder: MissionFolder) -> Report:
+def incomplete_report(folder: MissionFolder) -> Report:
     found = report(folder)
     assert not found.complete
     assert found.waiting_for in repr(found)
@@ -47,7 +47,7 @@ def said(folder: MissionFolder) -> Report:
 
 def test_a_mission_that_no_process_sends_is_named(folder: MissionFolder) -> None:
     """The command that sends it is named."""
-    found = said(folder)
+    found = incomplete_report(folder)
     assert found.waiting_for == 'a sender'
     assert 'missions resume' in found.remedy
 
@@ -55,7 +55,7 @@ def test_a_mission_that_no_process_sends_is_named(folder: MissionFolder) -> None
 @pytest.mark.usefixtures('sender')
 def test_a_mission_of_which_nothing_was_sent_is_named(folder: MissionFolder) -> None:
     """Records, artifacts and objects are counted."""
-    waiting_for = said(folder).waiting_for
+    waiting_for = incomplete_report(folder).waiting_for
     assert waiting_for == '5 records to be in its run, 2 artifacts to be in its run, 1 objects to be in the spool'
 
 
@@ -67,7 +67,7 @@ def test_a_mission_waits_while_its_plots_are_drawn(folder: MissionFolder) -> Non
         delivery.track()
         delivery.attach()
         delivery.spool()
-    found = said(folder)
+    found = incomplete_report(folder)
     assert (found.unsent, found.last_error) == (0, '')
     assert found.waiting_for == 'its pictures and its summary, which are being created'
     assert 'wait longer' in found.remedy
@@ -81,7 +81,7 @@ def test_a_mission_waits_for_its_node(folder: MissionFolder) -> None:
         node = Journal(folder.node.journal)
         node.create()
         stack.callback(node.close)
-        found = said(folder)
+        found = incomplete_report(folder)
     assert 'the node' in found.waiting_for
     assert 'check that the node runs' in found.remedy
 
@@ -93,7 +93,7 @@ def test_the_error_that_delays_a_mission_is_shown(folder: MissionFolder) -> None
     write_json(
         folder.path.parent / STATE, {'pid': 1, 'errors': {'tracking': {'error': 'Tower is away', 'remedy': 'switch it on'}}}
     )
-    found = said(folder)
+    found = incomplete_report(folder)
     assert (found.last_error, found.remedy, found.unattached) == ('Tower is away', 'switch it on', 1)
     assert found.waiting_for
 
@@ -121,4 +121,4 @@ def test_a_complete_mission_waits_for_nothing(folder: MissionFolder) -> None:
 def test_a_missing_journal_is_reported(folder: MissionFolder) -> None:
     """The report names it, and nothing is raised."""
     folder.journal.unlink()
-    assert 'missing' in said(folder).waiting_for
+    assert 'missing' in incomplete_report(folder).waiting_for

@@ -284,7 +284,7 @@ def writer(root: Path, clock: FakeClock | None = None, **more: Any) -> CatalogWr
     return CatalogWriter(root, CatalogSettings(), 'thor', clock or FakeClock(), **more)
 
 
-def told(parts: list[DataObject]) -> list[dict[str, Any]]:
+def gap_statements(parts: list[DataObject]) -> list[dict[str, Any]]:
     """The statements in parts of the journal."""
     found: list[dict[str, Any]] = []
     for part in parts:
@@ -327,7 +327,7 @@ def test_gaps_are_reported_once_before_their_watermark(spool: Spool, root: Path)
     store(spool, 'b')
     catalog = writer(root)
     made = catalog.parts()
-    assert what(told(made)) == [('gap', 'transport', 4, 0.6), ('complete', None, None, 0.6)]
+    assert what(gap_statements(made)) == [('gap', 'transport', 4, 0.6), ('complete', None, None, 0.6)]
     (part,) = [part for part in made if part.key.startswith('thor/_gaps/')]
     assert part.key == 'thor/_gaps/date=2025-10-18/thor_20251018T120000_a-boot.jsonl.zst'
     assert (part.protected, part.sensor, part.metadata['count'], part.metadata['gap_version']) == (True, '_catalog', '2', '1')
@@ -340,13 +340,13 @@ def test_another_process_continues_after_durable_parts(spool: Spool, root: Path)
     hear(spool, 1, 6)
     spool.commit()
     lost_with_its_process = writer(root).parts()
-    assert [row['cause'] for row in told(lost_with_its_process)] == ['transport']
+    assert [row['cause'] for row in gap_statements(lost_with_its_process)] == ['transport']
     again = writer(root).parts()
-    assert told(again) == told(lost_with_its_process)
+    assert gap_statements(again) == gap_statements(lost_with_its_process)
     spool.commit(again)
     hear(spool, 11)
     spool.commit()
-    assert [row['to_ns'] - NOON_NS for row in told(writer(root).parts()) if row['what'] == 'gap'] == [11 * SECOND // 10]
+    assert [row['to_ns'] - NOON_NS for row in gap_statements(writer(root).parts()) if row['what'] == 'gap'] == [11 * SECOND // 10]
 
 
 def test_a_late_message_withdraws_its_gap(spool: Spool, root: Path) -> None:
@@ -354,10 +354,10 @@ def test_a_late_message_withdraws_its_gap(spool: Spool, root: Path) -> None:
     catalog = writer(root)
     hear(spool, 1, 3)
     spool.commit()
-    (gap,) = told(catalog.parts())
+    (gap,) = gap_statements(catalog.parts())
     hear(spool, 2)
     spool.commit()
-    (withdrawn,) = told(catalog.parts())
+    (withdrawn,) = gap_statements(catalog.parts())
     assert (withdrawn['what'], withdrawn['id'], withdrawn['revision'] > gap['revision']) == ('withdrawn', gap['id'], True)
 
 
@@ -370,12 +370,12 @@ def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path)
     hear(spool, 40)
     store(spool, 'c', t_start_ns=NOON_NS + 4 * SECOND, t_end_ns=NOON_NS + 4 * SECOND)
     catalog = writer(root)
-    assert what(told(catalog.parts()))[-1] == ('complete', None, None, 2.0)
+    assert what(gap_statements(catalog.parts()))[-1] == ('complete', None, None, 2.0)
     spool.commit(outcomes=[Outcome(waiting, State.QUARANTINED, 'AccessDenied')])
-    rows = told(catalog.parts())
+    rows = gap_statements(catalog.parts())
     assert what(rows) == [('gap', 'AccessDenied', 1, 2.0), ('complete', None, None, 4.0)]
     assert retry(root).objects == 1
-    again = told(catalog.parts())
+    again = gap_statements(catalog.parts())
     assert what(again) == [('withdrawn', 'AccessDenied', 0, 2.0), ('complete', None, None, 2.0)]
     known = of_rows('thor', 'objects', CAMERA, NOON_NS + SECOND, NOON_NS + 4 * SECOND, counting([*rows, *again]))
     assert known.complete_ns == NOON_NS + 2 * SECOND
@@ -387,15 +387,15 @@ def test_no_watermark_overtakes_its_gaps(spool: Spool, root: Path) -> None:
     hear(spool, 1, 6)
     item = store(spool, 'a', State.PENDING, samples=2)
     made = catalog.parts()
-    assert [row['what'] for row in told(made)] == ['gap']
+    assert [row['what'] for row in gap_statements(made)] == ['gap']
     (part,) = spool.commit(made)
     spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
-    assert told(catalog.parts()) == []
+    assert gap_statements(catalog.parts()) == []
     spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'AccessDenied')])
-    assert told(catalog.parts()) == []
+    assert gap_statements(catalog.parts()) == []
     assert retry(root).objects == 1
     spool.commit(outcomes=[Outcome(part, State.DELIVERED)])
-    assert [row['what'] for row in told(catalog.parts())] == ['complete']
+    assert [row['what'] for row in gap_statements(catalog.parts())] == ['complete']
 
 
 def test_gaps_of_another_date_are_reported_before_the_watermark(spool: Spool, root: Path) -> None:
@@ -406,8 +406,8 @@ def test_gaps_of_another_date_are_reported_before_the_watermark(spool: Spool, ro
     store(spool, 'b', State.QUARANTINED, topic='/old', t_start_ns=NOON_NS - DAY_NS, t_end_ns=NOON_NS - DAY_NS)
     hear(spool, 2)
     store(spool, 'c')
-    assert [row['what'] for row in told(catalog.parts())] == ['gap']
-    assert [row['what'] for row in told(catalog.parts())] == ['complete']
+    assert [row['what'] for row in gap_statements(catalog.parts())] == ['gap']
+    assert [row['what'] for row in gap_statements(catalog.parts())] == ['complete']
 
 
 def test_gaps_of_a_lost_part_are_reported_again(spool: Spool, root: Path) -> None:
@@ -418,7 +418,7 @@ def test_gaps_of_a_lost_part_are_reported_again(spool: Spool, root: Path) -> Non
     (part,) = spool.commit(catalog.parts())
     assert catalog.parts() == []
     spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'missing')])
-    assert [row['what'] for row in told(catalog.parts())] == ['gap']
+    assert [row['what'] for row in gap_statements(catalog.parts())] == ['gap']
     assert catalog.parts() == []
 
 
@@ -441,18 +441,18 @@ def test_resending_reports_all_remembered_gaps(spool: Spool, root: Path) -> None
     catalog = writer(root)
     hear(spool, 1, 6)
     store(spool, 'a', samples=2)
-    before = told(catalog.parts())
+    before = gap_statements(catalog.parts())
     assert [row['what'] for row in before] == ['gap', 'complete']
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(writer(root).parts())])
     assert catalog.parts() == []
     assert resend_gaps(root) == 1
     again = catalog.parts()
-    assert told(again) == before
+    assert gap_statements(again) == before
     assert catalog.parts() == [], 'once'
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(again)])
-    assert [row['what'] for row in told(writer(root).parts())] == ['complete'], 'a new process does not start again'
+    assert [row['what'] for row in gap_statements(writer(root).parts())] == ['complete'], 'a new process does not start again'
     assert resend_gaps(root) == 1
-    assert len(told(writer(root).parts())) == len(before), 'also where no process ran when it was asked'
+    assert len(gap_statements(writer(root).parts())) == len(before), 'also where no process ran when it was asked'
 
 
 @pytest.mark.parametrize('is_of_older_version', [False, True])
@@ -467,10 +467,10 @@ def test_resent_watermarks_exclude_forgotten_gaps(spool: Spool, root: Path, is_o
         assert spool._connections.writing.gaps.forget(NOON_NS + SECOND * 27 // 10, 100)
         if is_of_older_version:
             spool._connections.writing._db.execute('UPDATE gaps SET to_ns = NULL WHERE begin_ns = ?', (FORGOTTEN,))
-    (mark,) = told(writer(root).parts())
+    (mark,) = gap_statements(writer(root).parts())
     assert (mark['from_ns'], mark['to_ns']) == (NOON_NS + SECOND * 2, NOON_NS + SECOND * 28 // 10), 'it was reported'
     resend_gaps(root)
-    (mark,) = told(writer(root).parts())
+    (mark,) = gap_statements(writer(root).parts())
     begin_ns = NOON_NS + (SECOND * 2 if is_of_older_version else SECOND * 26 // 10)
     assert (mark['what'], mark['from_ns'], mark['to_ns']) == ('complete', begin_ns, NOON_NS + SECOND * 28 // 10)
     (total,) = [gap for gap in spool._connections.writing.gaps.known({}) if gap.begin_ns == FORGOTTEN]
@@ -486,7 +486,7 @@ def test_no_watermark_covers_unreported_forgotten_gaps(spool: Spool, root: Path,
     monkeypatch.setattr(gap_table, 'MAX_ROWS', 0)
     with spool._connections.writing.transaction():
         assert spool._connections.writing.gaps.forget(0, 100)
-    (mark,) = told(writer(root).parts())
+    (mark,) = gap_statements(writer(root).parts())
     assert (mark['what'], mark['from_ns'], mark['to_ns']) == (
         'complete',
         NOON_NS + SECOND * 26 // 10,
@@ -507,10 +507,10 @@ def test_a_killed_session_ends_with_its_last_message(root: Path) -> None:
     second = new_spool(root, later)
     second.open()
     catalog = writer(root, later)
-    assert what(told(catalog.parts())) == [('complete', None, None, 0.2)]
+    assert what(gap_statements(catalog.parts())) == [('complete', None, None, 0.2)]
     hear(second, 1000, 1010)
     store(second, 'b', samples=2)
-    rows = told(catalog.parts())
+    rows = gap_statements(catalog.parts())
     assert [(row['what'], row['cause'], row['count']) for row in rows] == [
         ('gap', 'restart', 997), ('gap', 'transport', 9), ('complete', None, None),
     ]  # fmt: skip
@@ -532,8 +532,8 @@ def test_revisions_continue_after_the_index_is_rebuilt(root: Path) -> None:
     spool.open()
     hear(spool, 1, 6)
     spool.commit()
-    (gap,) = [row for row in told(writer(root).parts()) if row['cause'] == 'transport']
-    assert gap['revision'] > max(row['revision'] for row in told(before))
+    (gap,) = [row for row in gap_statements(writer(root).parts()) if row['cause'] == 'transport']
+    assert gap['revision'] > max(row['revision'] for row in gap_statements(before))
     spool.close()
 
 
@@ -544,12 +544,12 @@ def test_gaps_of_a_boot_are_reported_once_its_clock_is_known(spool: Spool, root:
     spool.commit()
     catalog = writer(root)
     made = catalog.parts()
-    (row,) = told(made)
+    (row,) = gap_statements(made)
     assert (row['clock'], row['t_from']) == ('unset', None)
     assert made[0].key.startswith('thor/_gaps/date=1970-01-01/')
     record = {'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'offsets': {'0123456789abcdef': NOON_NS}}
     (root / 'clock-thor.json').write_text(json.dumps(record), encoding='utf-8')
-    (dated,) = told(catalog.parts())
+    (dated,) = gap_statements(catalog.parts())
     assert (dated['id'], dated['clock'], dated['from_ns']) == (row['id'], 'set_later', NOON_NS + 5 * SECOND)
     (newest,) = counting([dated, row])
     assert newest['clock'] == 'set_later'
@@ -568,7 +568,7 @@ def test_a_missions_end_is_reported_soon(spool: Spool, root: Path) -> None:
     catalog.expedite()
     assert catalog.due() == []
     now[0] = 25.0
-    assert len(told(catalog.due())) == 1
+    assert len(gap_statements(catalog.due())) == 1
 
 
 def test_a_backlog_of_rows_is_split_with_the_watermark_last(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -578,6 +578,6 @@ def test_a_backlog_of_rows_is_split_with_the_watermark_last(spool: Spool, root: 
         hear(spool, number)
         store(spool, f'n{number}')
     catalog = writer(root)
-    found = [[row['what'] for row in told(catalog.due())] for _ in range(4)]
+    found = [[row['what'] for row in gap_statements(catalog.due())] for _ in range(4)]
     assert [what for part in found for what in part] == ['gap'] * 4 + ['complete']
     assert max(map(len, found)) <= 3

@@ -71,7 +71,7 @@ def started(root: Path, clocks: Clocks) -> Iterator[Callable[..., Run]]:
         run.spool.close()
 
 
-def said(root: Path) -> list[dict[str, Any]]:
+def metadata_of(root: Path) -> list[dict[str, Any]]:
     """The metadata of all objects."""
     return [json.loads(row['metadata']) for row in rows(root)]
 
@@ -94,7 +94,7 @@ def test_an_object_waits_for_the_clock(started: Callable[..., Run], root: Path) 
     (row,) = rows(root)
     assert (row['state'], row['reason']) == ('held', 'clock')
     assert row['key'] == 'thor/_unsynced/this-boot/camera/00000060_000_camera.jpg'
-    (metadata,) = said(root)
+    (metadata,) = metadata_of(root)
     assert metadata['clock'] == 'unset'
     assert (metadata['key_pattern'], metadata['boot_start_ns']) == (PATTERN, str(60 * SECOND))
     assert not {'t_start_ns', 't_end_ns'} & metadata.keys()
@@ -113,7 +113,7 @@ def test_an_object_is_dated_when_the_clock_is_set(
     items = run.unsynced.step()
     assert [item.key for item in items] == [FINAL, 'thor/camera/20251018/120000_front_1.jpg']
     assert [item.path.read_bytes() for item in items] == [b'one', b'two']
-    row, metadata = rows(root)[0], said(root)[0]
+    row, metadata = rows(root)[0], metadata_of(root)[0]
     assert (row['t_start_ns'], row['t_end_ns']) == (NOON_NS, NOON_NS + 1)
     assert (metadata['t_start_ns'], metadata['t_end_ns'], metadata['clock']) == (str(NOON_NS), str(NOON_NS + 1), 'set_later')
     assert (metadata['boot_start_ns'], metadata['clock_offset_ns']) == (str(60 * SECOND), str(NOON_NS - 60 * SECOND))
@@ -149,8 +149,8 @@ def test_after_ten_minutes_objects_are_sent_without_a_date(started: Callable[...
     clocks.wait(601)
     assert [item.key for item in run.unsynced.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']
     assert [item.key for item in run.take()] == ['thor/_unsynced/this-boot/camera/00000661_000_camera.jpg']
-    assert [metadata['clock'] for metadata in said(root)] == ['unset', 'unset']
-    assert not [metadata for metadata in said(root) if 't_start_ns' in metadata]
+    assert [metadata['clock'] for metadata in metadata_of(root)] == ['unset', 'unset']
+    assert not [metadata for metadata in metadata_of(root) if 't_start_ns' in metadata]
     clocks.set()
     assert run.unsynced.step() == []
     assert run.take()[0].metadata['clock'] == 'set'
@@ -188,7 +188,7 @@ def test_dates_survive_the_loss_of_the_index(started: Callable[..., Run], root: 
     assert run.spool.recovery.counts['files adopted'] == 1
     clocks.set()
     assert [item.key for item in run.unsynced.step()] == [FINAL]
-    assert said(root)[0]['t_start_ns'] == str(NOON_NS)
+    assert metadata_of(root)[0]['t_start_ns'] == str(NOON_NS)
 
 
 @pytest.mark.parametrize('pattern', ['../{date}/{time}', 'thor/{date}', '', 'a' * 300])

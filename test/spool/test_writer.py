@@ -31,10 +31,10 @@ def commits(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     counts: list[int] = []
     commit = spool.commit
 
-    def counted(objects: list[DataObject], *more: Any, **told: Callable[..., None]) -> list[SpooledObject]:
+    def counted(objects: list[DataObject], *more: Any, **named: Callable[..., None]) -> list[SpooledObject]:
         if objects:
             counts.append(len(objects))
-        return commit(objects, *more, **told)
+        return commit(objects, *more, **named)
 
     monkeypatch.setattr(spool, 'commit', counted)
     return counts
@@ -169,10 +169,10 @@ def test_a_thread_that_fails_in_a_commit_loses_nothing(opened: Callable[..., Spo
     monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
     deaths, commit = [SystemExit(1), MemoryError()], spool.commit
 
-    def dying(*given: Any, **told: Any) -> list[SpooledObject]:
+    def dying(*given: Any, **named: Any) -> list[SpooledObject]:
         if deaths:
             raise deaths.pop()
-        return commit(*given, **told)
+        return commit(*given, **named)
 
     monkeypatch.setattr(spool, 'commit', dying)
     writing = opened()
@@ -188,11 +188,11 @@ def test_outcomes_are_durable_before_they_are_reported(opened: Callable[..., Spo
     settled: list[int] = []
     states: list[str] = []
 
-    def told(ids: set[int]) -> None:
+    def on_settled(ids: set[int]) -> None:
         settled.extend(ids)
         states.append(rows(root)[0]['state'])
 
-    writing = opened(settled=told)
+    writing = opened(settled=on_settled)
     (item,) = spool.commit([make(topic=None)])
     writing.settle([Outcome(item, State.DELIVERED)])
     assert writing.close(60)
@@ -206,10 +206,10 @@ def test_a_failing_disk_loses_nothing(opened: Callable[..., SpoolWriter], spool:
     monkeypatch.setattr(worker, 'FIRST_PAUSE_S', 0.001)
     commit, failures = spool.commit, threading.Semaphore(3)
 
-    def failing(*arguments: object, **told: object) -> list[SpooledObject]:
+    def failing(*arguments: object, **named: object) -> list[SpooledObject]:
         if failures.acquire(blocking=False):
             raise OSError(28, 'No space left on device')
-        return commit(*arguments, **told)  # type: ignore[arg-type]
+        return commit(*arguments, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(spool, 'commit', failing)
     writing = opened()
@@ -279,11 +279,11 @@ def test_files_are_removed_while_outcomes_are_settled(
     commit, remove = spool.commit, spool.remove_files
     may_commit, is_committing, removed_by = threading.Event(), threading.Event(), list[int]()
 
-    def committing(objects: list[DataObject], *more: Any, **told: Any) -> list[SpooledObject]:
+    def committing(objects: list[DataObject], *more: Any, **named: Any) -> list[SpooledObject]:
         if objects:
             is_committing.set()
             assert may_commit.wait(60)
-        return commit(objects, *more, **told)
+        return commit(objects, *more, **named)
 
     def removing(outcomes: Sequence[Outcome]) -> None:
         if not removed_by:
@@ -391,9 +391,9 @@ def test_encoders_wait_while_the_queue_is_full(opened: Callable[..., SpoolWriter
     monkeypatch.setattr(writer_module, 'MAX_WAITING_BYTES', 10)
     commit, hung = spool.commit, threading.Event()
 
-    def hanging(*arguments: object, **told: object) -> list[SpooledObject]:
+    def hanging(*arguments: object, **named: object) -> list[SpooledObject]:
         assert hung.wait(60)
-        return commit(*arguments, **told)  # type: ignore[arg-type]
+        return commit(*arguments, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(spool, 'commit', hanging)
     writing = opened()
@@ -428,7 +428,7 @@ def test_the_accounts_become_durable_without_objects(opened: Callable[..., Spool
         account.skipped += 1
     written, commit = threading.Event(), spool.commit
 
-    def noticed(*arguments: object, **told: object) -> list[SpooledObject]:
+    def noticed(*arguments: object, **named: object) -> list[SpooledObject]:
         found = commit(*arguments)  # type: ignore[arg-type]
         written.set()
         return found

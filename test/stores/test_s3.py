@@ -160,11 +160,11 @@ def test_a_name_and_a_password_in_the_url_are_not_sent(
         handler = server.RequestHandlerClass
         report = handler._told  # type: ignore[attr-defined]
 
-        def tells(request: Any) -> bool:
+        def on_request(request: Any) -> bool:
             asked.append((request.headers['Host'], request.path.rpartition('/')[0].split('/')[1]))
             return bool(report(request))
 
-        monkeypatch.setattr(handler, '_told', tells)
+        monkeypatch.setattr(handler, '_told', on_request)
         store = opened(f'{server.url.replace("://", "://name:password@")}/base')
         assert store.put(spool('a', b'x')) is Put.CREATED
         assert set(asked) == {(server.url.removeprefix('http://'), 'base')}

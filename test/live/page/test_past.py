@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from lake.making import NOON_NS, add, add_part, folder_store
 from live.browsing import CHROMIUM, HOSTILE, NAMES, Served, fits, holds, opened, press
-from live.test_history import LATE_S, ODOMETRY, jpeg, late_patrol, odometry, patrol, told
+from live.test_history import LATE_S, ODOMETRY, jpeg, late_patrol, object_row, odometry, patrol
 
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, UploadSettings
 from shadowhound_data_logger.live.server import LiveSettings
@@ -35,11 +35,11 @@ def minute(store: ObjectStore, folder: Path) -> None:
     """A minute of camera at 5 Hz and odometry, and the part with their rows."""
     rows = []
     for number in range(300):
-        rows.append(told(number / 5, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg'))
+        rows.append(object_row(number / 5, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg'))
         rows[-1]['key'] = f'thor/camera/{number}.jpg'
         add(store, folder, rows[-1]['key'], jpeg(number % 256))
     for second in range(60):
-        rows.append(told(second, 'odom', '/odom', ODOMETRY, 'json'))
+        rows.append(object_row(second, 'odom', '/odom', ODOMETRY, 'json'))
         add(store, folder, rows[-1]['key'], odometry(second))
     add_part(store, rows, 'minute', folder)
 
@@ -137,7 +137,9 @@ def test_the_page_of_a_store_shows_the_past_without_a_robot(
     monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
         patrol(store, tmp_path)
-        rows = [told(6, 'camera', f'/{name}', COMPRESSED_IMAGE, 'jpg', mission_id=name, mission_type=name) for name in NAMES]
+        rows = [
+            object_row(6, 'camera', f'/{name}', COMPRESSED_IMAGE, 'jpg', mission_id=name, mission_type=name) for name in NAMES
+        ]
         for place, row in enumerate(rows):
             row['key'] = f'thor/names/{place}.jpg'
             add(store, tmp_path / 'tmp', row['key'], jpeg(9))

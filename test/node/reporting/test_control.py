@@ -50,7 +50,7 @@ def raw(serving: Serving, name: str = 'control.sock') -> socket.socket:
     return client
 
 
-def heard(client: socket.socket) -> list[dict[str, Any]]:
+def read_lines(client: socket.socket) -> list[dict[str, Any]]:
     """Everything that the node sends until it closes the connection."""
     report = b''
     with suppress(ConnectionResetError):
@@ -137,7 +137,7 @@ def test_an_invalid_request_gets_an_error(serve: Callable[..., Serving], line: b
     with raw(serving) as client:
         client.sendall(line + b'\n{"do": "flush"}\n')
         client.shutdown(socket.SHUT_WR)
-        refused, done = heard(client)
+        refused, done = read_lines(client)
     assert (refused['ok'], refused['robot']) == (False, 'thor')
     assert 'a line such as {"do": "flush"}' in refused['error']
     assert done['message'] == 'flush is done'
@@ -151,7 +151,7 @@ def test_a_line_has_a_maximum_length(serve: Callable[..., Serving], content: byt
     with raw(serving) as client:
         with pytest.raises((BrokenPipeError, ConnectionResetError)):
             client.sendall(content)
-        (refused,) = heard(client)
+        (refused,) = read_lines(client)
     assert refused['error'] == f'a request has at most {MAX_REQUEST_BYTES} bytes'
     assert works(serving)
     assert serving.asked == [{'do': 'flush'}]
@@ -164,7 +164,7 @@ def test_a_line_of_maximum_length_is_accepted(serve: Callable[..., Serving]) -> 
     with raw(serving) as client:
         client.sendall(line)
         client.shutdown(socket.SHUT_WR)
-        (done,) = heard(client)
+        (done,) = read_lines(client)
     assert done['ok']
 
 
@@ -174,7 +174,7 @@ def test_an_incomplete_line_is_not_a_request(serve: Callable[..., Serving]) -> N
     with raw(serving) as client:
         client.sendall(b'{"do": "flush"}')
         client.shutdown(socket.SHUT_WR)
-        (refused,) = heard(client)
+        (refused,) = read_lines(client)
     assert 'must end with a newline' in refused['error']
     assert serving.asked == []
 
@@ -189,7 +189,7 @@ def test_a_client_must_send_a_line(serve: Callable[..., Serving], drips: bool) -
                 while True:
                     client.sendall(b' ')
                     time.sleep(SHORT_S / 20)
-        (refused,) = heard(client)
+        (refused,) = read_lines(client)
     assert f'no complete line was received for {SHORT_S:g} s' in refused['error']
     assert works(serving)
 
@@ -243,7 +243,7 @@ def test_clients_are_notified_on_close(serve: Callable[..., Serving]) -> None:
         until(lambda: len(serving.control._clients) == 2)
         closes = threading.Thread(target=serving.control.close)
         closes.start()
-        assert [answer['error'] for answer in (*heard(waits), *heard(idles))] == ['the node is closing'] * 2
+        assert [answer['error'] for answer in (*read_lines(waits), *read_lines(idles))] == ['the node is closing'] * 2
         closes.join()
     with pytest.raises(NodeUnavailable, match='no node is running with the spool'):
         connect(serving.spool)
@@ -264,7 +264,7 @@ def test_the_socket_can_be_closed_during_an_answer(serve: Callable[..., Serving]
             time.sleep(0.01)
         threading.Timer(SHORT_S, gate.set).start()
         serving.control.close()
-        assert heard(client)[0]['ok']
+        assert read_lines(client)[0]['ok']
     assert not caplog.records
 
 

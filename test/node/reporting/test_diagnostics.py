@@ -55,7 +55,7 @@ def changed(**values: Any) -> NodeStatus:
 LATE = {'publisher': 'p', 'state': 'offset', 'offset_s': 146.0, 'spread_s': 0.1, 'since_ns': 0, 'cause': 'late'}
 
 
-def told(name: str, **values: Any) -> tuple[Any, str]:
+def entry_of(name: str, **values: Any) -> tuple[Any, str]:
     """Level and message of an entry, after a while without problems."""
     found = {entry[0]: entry for entry in entries(changed(**values), changed())}
     return found[name][1], found[name][2]
@@ -67,7 +67,7 @@ def test_undiscovered_publishers_are_an_error() -> None:
         topic: {'publishers': 1, 'nodes': [], 'seconds': 40, 'text': f'{topic} is not all heard'} for topic in ('/imu', '/odom')
     }
     for topic in undiscovered:
-        assert told(topic, middleware__undiscovered=undiscovered) == (ERROR, f'{topic} is not all heard')
+        assert entry_of(topic, middleware__undiscovered=undiscovered) == (ERROR, f'{topic} is not all heard')
 
 
 def test_a_healthy_node_is_ok() -> None:
@@ -75,7 +75,7 @@ def test_a_healthy_node_is_ok() -> None:
     found = list(entries(changed(), changed()))
     assert [entry[0] for entry in found] == ['node', '/imu', 'bag', 'events', 'spool', 'store', 'clock', 'workers']
     assert {entry[1] for entry in found} == {OK}
-    assert told('/imu')[1] == '100 Hz'
+    assert entry_of('/imu')[1] == '100 Hz'
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_a_healthy_node_is_ok() -> None:
 )  # fmt: skip
 def test_the_state_of_a_topic_has_its_level(values: dict[str, Any], level: Any, words: str) -> None:
     """Recent losses and silence are a warning; a topic without a publisher is stale, a disabled one is OK."""
-    assert told('/imu', **values) == (level, words)
+    assert entry_of('/imu', **values) == (level, words)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_the_state_of_a_topic_has_its_level(values: dict[str, Any], level: Any, 
 )  # fmt: skip
 def test_every_other_part_has_its_level(name: str, values: dict[str, Any], level: Any, words: str) -> None:
     """An unreachable store and a spool filling up are warnings; refused credentials, quarantine and defects are errors."""
-    found = told(name, **values)
+    found = entry_of(name, **values)
     assert found[0] == level
     assert words in found[1]
 
