@@ -15,7 +15,8 @@ from rclpy.node import Node
 from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.ros.endpoints import LARGE_TYPES, Plan
-from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
+from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints, unavailable
+from shadowhound_data_logger.ros.type_descriptions import TypeDescriptions
 
 AT_ONCE: Final = 2
 START_S: Final = 0.5
@@ -97,8 +98,8 @@ class _Sample:
 class Sampler:
     """Samples the topics that viewers need, on the thread ``topics``. New; ``follow`` and ``step`` repeatedly; close once."""
 
-    def __init__(self, node: Node, on_items: Callable[[list[LiveItem]], None]) -> None:
-        self._node, self._on_items = node, on_items
+    def __init__(self, node: Node, descriptions: TypeDescriptions, on_items: Callable[[list[LiveItem]], None]) -> None:
+        self._node, self._descriptions, self._on_items = node, descriptions, on_items
         self._wanted: Mapping[str, str] = {}
         self._samples: dict[str, _Sample] = {}
         self._ended_s: dict[str, float] = {}
@@ -124,10 +125,12 @@ class Sampler:
         topic = min(ended_s, key=ended_s.__getitem__, default='')
         if topic and now_s - ended_s[topic] >= AGAIN_S:
             self._start_s = now_s + START_S
+            is_first, type_name = topic not in self._newest, self._wanted[topic]
             try:
-                is_first = topic not in self._newest
-                self._samples[topic] = _Sample(self._node, topic, self._wanted[topic], is_first=is_first)
+                self._samples[topic] = _Sample(self._node, topic, type_name, is_first=is_first)
             except (TypeUnavailable, SubscriptionRefused) as error:
+                if unavailable(type_name) and self._descriptions.poll(topic, type_name, now_s):
+                    return  # its publisher may answer until the next start
                 self._end(topic, now_s, {'why': visible(str(error))[:300]}, None)
 
     def _end(self, topic: str, now_s: float, told: Mapping[str, Any], newest: tuple[int, float] | None) -> None:

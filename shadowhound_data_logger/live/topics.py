@@ -181,8 +181,8 @@ class Topics:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         with without_our_profile(os.environ), dead_ports_avoided(get_default_context().get_domain_id()):
             self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
-        self._sampler = Sampler(self._node, self._on_items)
         self._descriptions = TypeDescriptions(self._node, PolledGroup())
+        self._sampler = Sampler(self._node, self._descriptions, self._on_items)
         self._guard = PortGuard()
         self.worker.start()
 

@@ -385,12 +385,15 @@ def test_why_a_topic_cannot_be_sampled_is_reported(tmp_path: Path, monkeypatch: 
 
 
 def test_a_message_of_an_unknown_type_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its publisher provides the definition."""
+    """Its publisher provides the definition, also for a sample of the topic."""
 
     async def doing(found: Robot) -> None:
         with publisher(int(os.environ['ROS_DOMAIN_ID'])):
             async with found.tab() as tab:
                 await until(lambda: '/arrays' in tab.topics, 'the topic is found')
+                await tab.watch('/arrays#?')
+                await until(lambda: '/arrays' in tab.samples, 'it is sampled')
+                assert tab.samples['/arrays']['bytes'] > 100
                 await tab.watch('/arrays#')
                 await until(lambda: '/arrays#' in tab.heads, 'its message is shown')
                 assert 'alignment_check' in str(tab.heads['/arrays#'])
