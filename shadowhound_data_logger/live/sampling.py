@@ -24,6 +24,8 @@ START_S: Final = 0.5
 AGAIN_S: Final = 5.0
 """Minimum interval between two samples of a topic."""
 SAMPLE_S: Final = 2.0
+SILENT_S: Final = 3.0
+"""Duration without a message: on a busy machine a publisher may match the subscription a second late."""
 SLOW_S: Final = 4.5
 """Duration while fewer than ``FEW`` messages have arrived, but at least one."""
 FEW: Final = 3
@@ -64,7 +66,7 @@ class _Sample:
     def is_complete(self, now_s: float) -> bool:
         took_s, count = now_s - self._began_s, len(self._arrivals)
         return (
-            took_s >= (SLOW_S if 0 < count < FEW else SAMPLE_S)
+            took_s >= (SAMPLE_S if count >= FEW else SLOW_S if count else SILENT_S)
             or (took_s >= ENOUGH_S and count >= ENOUGH)
             or (count >= ENOUGH_LARGE and sum(self._sizes) >= ENOUGH_BYTES)
         )

@@ -195,14 +195,16 @@ function Head({ onSignIn }) {
   const told = figures.value;
   const isLost = connection.value !== 'connected';
   const running = told?.state === 'running';
-  const [text, kind] = past.value ? ['back in time', 'watch'] : !session.value.has_live ? ['the store', 'none'] : isLost ? ['no connection: trying again', 'bad'] : !told ? ['connecting', 'none'] : running ? [told.paused ? 'paused' : 'recording', told.paused ? 'watch' : 'good']
-    : [told.state === 'not_answering' ? 'the node does not answer' : 'the node is not running', 'bad'];
+  const [text, kind, what] = past.value ? ['back in time', 'watch', 'The page shows a moment of the past'] : !session.value.has_live ? ['the store', 'none', 'The page shows what robots have delivered to a store']
+    : isLost ? ['no connection: trying again', 'bad', 'The robot’s page cannot be reached: what is shown was received before'] : !told ? ['connecting', 'none', 'Nothing has been received yet']
+    : running ? (told.paused ? ['paused', 'watch', 'The node runs and stores nothing until an operator resumes it'] : ['recording', 'good', 'The node runs and stores messages as its settings say'])
+    : [told.state === 'not_answering' ? 'the node does not answer' : 'the node is not running', 'bad', 'The node, which stores the messages, writes a status once per second: it did not in the last five seconds'];
   const signOut = async () => {
     await fetch('/api/sign-out', { method: 'POST', headers: { 'X-CSRF-Token': session.value.csrf } });
     location.reload();
   };
   return html`<header><a class="skip" href="#data">Skip to the data</a><img src="icon.svg" alt="" width="30" height="30" /><h1 title=${session.value?.robot}>${session.value?.robot || 'Live'}</h1>
-    <span class=${`pill ${kind}`} role="status">${text}</span>
+    <span class=${`pill ${kind}`} role="status" title=${what}>${text}</span>
     ${!past.value && session.value.has_live && html`<nav aria-label="Parts of this page"><a href="#now">Now</a><a href="#data">The data</a><a href="#gaps">Gaps</a></nav>`}
     <span class="spacer"></span>${told && html`<${Age} kind="figures" />`}
     ${session.value?.signed_in ? html`<button type="button" onClick=${signOut}>Sign out<span class="role"> (${session.value.role})</span></button>` : html`<button type="button" onClick=${onSignIn}>Sign in</button>`}</header>`;
