@@ -34,8 +34,11 @@ from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.types import PLACEHOLDER, MessageTypes
 from shadowhound_data_logger.ros.reader import installed_class, rclpy_version
 
-TESTED: Final = {((7,), 'rmw_fastrtps_cpp'), ((7,), 'rmw_cyclonedds_cpp'), ((9,), 'rmw_fastrtps_cpp')}
-"""Major versions of rclpy (7: Jazzy, 9: Kilted) and RMWs."""
+TESTED: Final = {
+    ((3,), 'rmw_fastrtps_cpp'), ((3,), 'rmw_cyclonedds_cpp'), ((7,), 'rmw_fastrtps_cpp'), ((7,), 'rmw_cyclonedds_cpp'),
+    ((9,), 'rmw_fastrtps_cpp'),
+}  # fmt: skip
+"""Major versions of rclpy (3: Humble, 7: Jazzy, 9: Kilted) and RMWs."""
 FIRST_WITH_HASH: Final = 7
 """Types have hashes and keys since this major version of rclpy."""
 RMWS: Final[Mapping[str, tuple[bytes, ...]]] = {
@@ -267,7 +270,7 @@ class Maker:
                 return identifier.decode()
             if identifier == INTROSPECTION and not _equal_members(self._layout, ours.data, real.data):
                 return 'structure'
-            if identifier == FAST_DDS and _names(ours.data) != _names(real.data):
+            if identifier == FAST_DDS and _names(self._layout, ours.data) != _names(self._layout, real.data):
                 return 'name'
             if self._layout.has_hash and _hash(ours) != _hash(real):
                 return 'hash'
@@ -405,9 +408,9 @@ def _equal_members(layout: Layout, ours: int, theirs: int) -> bool:
     )
 
 
-def _names(callbacks: int) -> tuple[bytes, bytes, bool]:
+def _names(layout: Layout, callbacks: int) -> tuple[bytes, bytes, bool]:
     found = Callbacks.from_address(callbacks)
-    return found.namespace, found.name, bool(found.key_callbacks)
+    return found.namespace, found.name, layout.has_hash and bool(found.key_callbacks)
 
 
 def _described(support: TypeSupport) -> int:
