@@ -136,6 +136,8 @@ class PastReader:
             return {'robots': self._source.robots()}, b''
         if do == 'fleet':
             return {'fleet': self._source.fleet()}, b''
+        if not robot and not (robot := next(iter(self._source.robots()), '')):  # the page of a store shows its first robot
+            raise ValueError('no robot has stored anything yet')
         if not isinstance(robot, str) or not is_name(robot):
             raise ValueError('robot is the name of a robot')
         if do == 'moment':

@@ -84,7 +84,8 @@ class PastRoutes:
             times = {name: query_ms(request, name) for name in takes}
         except ValueError as error:
             return problem(400, str(error))
-        if not is_name(robot) or None in times.values():
+        is_known = is_name(robot) or do in {'robots', 'fleet'} or (self._is_of_store and not robot)
+        if not is_known or None in times.values():
             return problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
         more = {name: request.query[name] for name in ('by', 'fit') if name in request.query}
         found = await self.ask(do, robot, {**times, **more})

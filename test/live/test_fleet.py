@@ -82,7 +82,7 @@ def test_data_that_the_robot_had_and_lost_is_worse(robots: Path) -> None:
 def test_the_table_of_robots_is_ordered_and_leads_to_each(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order, with names as text; a click shows the past of that robot."""
     store_of(home, time.time_ns() - 10 * SECOND)
-    settings = LiveSettings(spool=home / 'none', robot='thor', tokens=home / 'live', port=0, is_of_store=True)
+    settings = LiveSettings(spool=home / 'none', robot='', tokens=home / 'live', port=0, is_of_store=True)
     with Served(settings, monkeypatch) as served:
         page = opened(browser, served.server.url)
         holds(page, 'document.querySelectorAll("tr[data-robot]:not([data-state=unknown])").length === 4')
