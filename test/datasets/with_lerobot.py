@@ -64,7 +64,7 @@ def load(out: str, folder: str) -> None:
     kinds = {name: feature.type.value for name, feature in dataset_to_policy_features(plain.meta.features).items()}
     fields = {name: np.array(values) for name, values in found.items() if name != CAMERA}
     images = (np.array(found[CAMERA]) * 255).round().astype(np.uint8)
-    np.savez(out, images=images.transpose(0, 2, 3, 1), windows=np.concatenate(actions), episodes=plain.num_episodes,
+    np.savez(out, pictures=images.transpose(0, 2, 3, 1), windows=np.concatenate(actions), episodes=plain.num_episodes,
              kinds=np.array([f'{name}={kind}' for name, kind in kinds.items()]), **fields)  # fmt: skip
 
 
