@@ -204,11 +204,11 @@ def test_topics_that_are_logged_by_their_type_are_examined(examined: Examined) -
 
 @pytest.mark.long('a robot of its own')
 def test_missing_go2_interfaces_are_named(scene: Scene, domain: int, tmp_path: Path) -> None:
-    """In the doctor's child process for ROS, with a workspace that was not sourced."""
+    """In the doctor's child process for ROS, with a workspace that was not sourced, and without types made from definitions."""
     (tmp_path / 'go2_interfaces').mkdir()
     (tmp_path / 'go2_interfaces/__init__.py').write_text("raise ImportError('not sourced')")
     path = os.pathsep.join(filter(None, [str(tmp_path), scene.environ.get('PYTHONPATH')]))
-    scene.environ |= {'PYTHONPATH': path, 'ROS_DOMAIN_ID': str(domain)}
+    scene.environ |= {'PYTHONPATH': path, 'ROS_DOMAIN_ID': str(domain), 'SHADOWHOUND_TYPE_SUPPORT': 'off'}
     scene.parameters |= {'sensors': ['odom', 'imu', 'states']}  # an IMU can also publish a standard message
     found = {result.check: result for result in scene.ask('ros')}
     assert found['ros.types'].severity is Severity.ERROR
