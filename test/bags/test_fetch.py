@@ -63,19 +63,19 @@ def test_a_fetched_bag_is_the_uploaded_bag(store: Counting, tmp_path: Path) -> N
 
     class Sum(ProgressListener):
         total = 0
-        result = 0
+        received = 0
 
         def begin(self, total: int) -> None:
             self.total = total
 
         def have(self, count: int) -> None:
-            self.had += count
+            self.received += count
 
     report = Sum()
     found = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here', progress=report)
     assert files(found.folder) == files(tmp_path / 'robot' / NAME)
     assert (found.is_complete, found.unverified) == (True, ())
-    assert report.had == report.total == found.bytes == found.downloaded
+    assert report.received == report.total == found.bytes == found.downloaded
 
 
 def test_a_second_run_downloads_nothing(store: Counting, tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_without_an_interpreter_missions_are_journaled(
     """One warning with a remedy, no error, and nothing is started."""
     nowhere(monkeypatch, tmp_path)
     monkeypatch.setattr(sys, 'executable', str(host) if executable else executable)
-    logger = MissionDataLogger(home=tmp_path / 'home', start_timeout_s=0.1)
+    logger = MissionDataLogger(home=tmp_path / 'home', robot='thor', start_timeout_s=0.1)
     assert logger._replayer is not None
     assert logger.start_mission('patrol', 'x').startswith('patrol_')
     logger.log_metric('a', 1.0)
