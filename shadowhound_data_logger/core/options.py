@@ -137,9 +137,11 @@ class KeepSettings:
         high=1000.0
     )  # fmt: skip
     missions: tuple[str, ...] = _setting(('',), 'Types of missions that are always uploaded completely.')
-    preview_s: float = _setting(1.0, 'Seconds between two previews of a camera; 0: none.', low=0.0, high=3600.0)
+    preview_s: float = _setting(
+        1.0, 'Seconds between two previews of a camera, uploaded immediately; 0: none.', low=0.0, high=3600.0
+    )
     poll_s: float = _setting(10.0, 'Seconds between two checks for requests.', low=0.5, high=3600.0)
-    when: str = _setting('', 'Rule for requested objects; empty: always.')
+    when: str = _setting('', 'Upload requested objects only while this rule is true; empty: always.')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +156,9 @@ class UploadSettings:
         60.0, 'Longest pause between two attempts while the store is unreachable.', low=0.1, high=3600.0
     )
     max_mbps: float = _setting(0.0, 'Maximum megabits per second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
-    when: str = _setting('', 'Upload only while this rule is true; empty: always.')
+    when: str = _setting(
+        '', 'Upload only while this rule is true: \'lowstate:bms_state.soc > 30 and wifi.ssid == "lab"\'; empty: always.'
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,7 +174,7 @@ class ClockSettings:
 
     max_offset_s: float = _setting(
         86_400.0,
-        'Seconds that a stamp may differ from the arrival; otherwise the arrival dates the message.',
+        'Seconds that a stamp may differ from the arrival of its message; beyond that, the arrival dates it.',
         low=1.0,
         high=1e9,
     )
@@ -227,7 +231,9 @@ class BagSettings:
     topics: tuple[str, ...] = _setting(('',), 'Topics to record; with neither topics nor a regex, those of the sensors.')
     regex: str = _setting('', 'Record also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
     exclude: str = _setting('', 'Skip topics that match this, unless they are in topics.')
-    slice_s: float = _setting(60.0, 'Seconds in one file of a bag.', low=1.0, high=86_400.0)
+    slice_s: float = _setting(
+        60.0, 'Seconds in one file of a bag; each is uploaded while the next one is recorded.', low=1.0, high=86_400.0
+    )
     slice_bytes: int = _setting(256 * MEBI, 'Maximum bytes in one file of a bag.', low=MEBI)
     compression: str = _setting('zstd', 'Compression of the bag.', choices=COMPRESSIONS)
     priority: int = _setting(8, '0 is uploaded first and evicted last; 9 is uploaded last and evicted first.', low=0, high=9)
@@ -252,7 +258,7 @@ class EventSettings:
         high=1e5,
         live=True,
     )
-    max_bytes: int = _setting(64 * MEBI, 'Memory for them; beyond it the oldest messages are dropped.', low=MEBI, live=True)
+    max_bytes: int = _setting(64 * MEBI, 'Memory for recent messages; beyond it the oldest are dropped.', low=MEBI, live=True)
     log_event: str = _setting(
         '.*', "An agent's log_event triggers an event where its name matches this regular expression; empty for none.", live=True
     )
@@ -260,7 +266,7 @@ class EventSettings:
         ('',),
         'What triggers an event: "low_battery: lowstate:bms_state.soc < 20 for 5" is name, topic:field, comparison, seconds.',
     )
-    when: str = _setting('', 'Rule for bags of events, instead of upload.when; empty: always.')
+    when: str = _setting('', 'Upload bags of events only while this rule is true, instead of upload.when; empty: always.')
 
     @property
     def enabled(self) -> bool:

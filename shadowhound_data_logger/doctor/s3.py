@@ -294,7 +294,7 @@ def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
     try:
         item = s3_put.probe(MAILBOX_BUCKET, inbox_key(RACED))
         requests.put(item, s3_put.BODY, conditional=True)
-        winners = [_winners(requests, number) for number in range(RACES)]
+        winners = [_winners(requests) for _ in range(RACES)]
         is_made = _is_created(requests, inbox_key(f'{RACED}_{uuid.uuid4().hex}'))
     except AccessDenied:
         yield info(
@@ -304,7 +304,7 @@ def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
             remedy,
         )
         return
-    if winners != [1] * RACES:
+    if max(winners) > 1 or not any(winners):  # none of a round: another doctor replaced it
         seen = f'of {RACERS} concurrent replacements of a mailbox {winners} succeeded'
         yield warning(check, seen, 'the server does not apply If-Match: requests get lost', 'use SeaweedFS 4, or a newer MinIO')
     elif is_made:
@@ -313,10 +313,10 @@ def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
         yield ok(check, f'of {RACERS} concurrent replacements of a mailbox one succeeds')
 
 
-def _winners(requests: S3Requests, number: int) -> int:
+def _winners(requests: S3Requests) -> int:
     found = requests.changed(MAILBOX_BUCKET, inbox_key(RACED), '', LISTING_BYTES)
     assert found is not None  # an ETag is never empty
-    bodies = [b'%d %d' % (number, racer) for racer in range(RACERS)]
+    bodies = [uuid.uuid4().bytes for _ in range(RACERS)]  # with equal bodies of another doctor an old ETag would be valid again
     with ThreadPoolExecutor(RACERS) as pool:
         return sum(pool.map(lambda body: requests.replace(MAILBOX_BUCKET, inbox_key(RACED), body, found[1]), bodies))
 

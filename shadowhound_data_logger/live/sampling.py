@@ -83,7 +83,7 @@ class _Sample:
             span_s = (now_ns - first) / 1e9
         return round((count - 1) / max(span_s, 1e-3), 2)
 
-    def told(self, now_s: float) -> dict[str, Any]:
+    def figures(self, now_s: float) -> dict[str, Any]:
         return {'seconds': round(now_s - self._began_s, 1), 'messages': len(self._arrivals), 'hz': self.hz,
                 'latched': self.is_latched}  # fmt: skip
 
@@ -120,7 +120,7 @@ class Sampler:
             sample.drain()
             if sample.is_complete(now_s):
                 self._samples.pop(topic).close()
-                self._end(topic, now_s, sample.told(now_s), sample.newest(now_s))
+                self._end(topic, now_s, sample.figures(now_s), sample.newest(now_s))
         if not self._wanted or len(self._samples) >= AT_ONCE or now_s < self._start_s:
             return
         ended_s = {topic: self._ended_s.get(topic, -math.inf) for topic in self._wanted if topic not in self._samples}
@@ -135,7 +135,7 @@ class Sampler:
                     return  # its publisher may answer until the next start
                 self._end(topic, now_s, {'why': visible(str(error))[:300]}, None)
 
-    def _end(self, topic: str, now_s: float, told: Mapping[str, Any], newest: tuple[int, float] | None) -> None:
+    def _end(self, topic: str, now_s: float, figures: Mapping[str, Any], newest: tuple[int, float] | None) -> None:
         for known in (self._ended_s, self._newest):
             if len(known) >= MAX_KNOWN:
                 known.clear()
@@ -144,7 +144,7 @@ class Sampler:
             self._newest[topic] = newest
         size, newest_s = self._newest.get(topic, (None, None))
         head = {'at': round(now_s * 1e3, 1), 'of': topic, 'bytes': size,
-                'age_s': None if newest_s is None else round(now_s - newest_s, 3), **told}  # fmt: skip
+                'age_s': None if newest_s is None else round(now_s - newest_s, 3), **figures}  # fmt: skip
         self._on_items([LiveItem('', 'sample', head=head)])
 
     def close(self) -> None:

@@ -76,9 +76,9 @@ def run_smoke(folder: Path, manifest: PolicyManifest, isolation: str = SANDBOX, 
     Raises PolicyRefused: ``nan`` ``output`` ``slow`` ``inputs`` ``pickle`` ``memory`` ``time`` or ``smoke`` (it crashed), and
     PolicyError if onnxruntime is not installed, or if a sandbox is required but not available.
     """
-    folder = folder.absolute()
     import tempfile  # noqa: PLC0415 - `status` imports this module
 
+    folder = folder.absolute()
     with tempfile.TemporaryDirectory(prefix='shadowhound-policy-') as empty:
         sandbox, problem = open_sandbox(folder, empty)
         if problem and isolation != LIMITS:

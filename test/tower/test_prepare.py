@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import random
 import re
@@ -37,7 +38,7 @@ from shadowhound_data_logger.core.errors import AccessDenied, ForeignObject, Lak
 from shadowhound_data_logger.core.mailbox import KeptFilter, decode_inbox, inbox_key
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.doctor.model import Severity
-from shadowhound_data_logger.doctor.s3 import RACED, race_mailboxes
+from shadowhound_data_logger.doctor.s3 import RACED, RACERS, race_mailboxes
 from shadowhound_data_logger.doctor.s3_put import single_requests
 from shadowhound_data_logger.lake import prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -286,6 +287,8 @@ class _Ignoring:
 
     def __init__(self, *, makes: bool) -> None:
         self._makes = makes
+        self._count = itertools.count()
+        self.bodies: list[bytes] = []
 
     def put(self, *_: Any, **__: Any) -> None:
         """The object exists afterwards."""
@@ -296,7 +299,8 @@ class _Ignoring:
     def replace(self, _: str, key: str, body: bytes, __: str) -> bool:
         if key != inbox_key(RACED):
             return self._makes
-        return not self._makes or body.endswith(b' 0')
+        self.bodies.append(body)
+        return not self._makes or next(self._count) % RACERS == 0
 
 
 @pytest.mark.long('a second of CPU or more')
@@ -306,6 +310,19 @@ def test_the_doctor_detects_a_server_that_ignores_if_match(makes: bool, says: st
     (found,) = race_mailboxes(_Ignoring(makes=makes))  # type: ignore[arg-type]
     assert found.is_finding
     assert says in found.cause
+
+
+@pytest.mark.parametrize('winners', [[0, 1, 0], [0, 0, 0], [1, 2, 1]])
+def test_two_doctors_may_race_at_the_same_time(monkeypatch: pytest.MonkeyPatch, winners: list[int]) -> None:
+    """Of a round, the other doctor may win all; no body repeats, because an ETag would be valid again with it."""
+    server = _Ignoring(makes=False)
+    for _ in range(2):
+        list(race_mailboxes(server))  # type: ignore[arg-type]
+    assert len(set(server.bodies)) == len(server.bodies) > RACERS
+    rounds = iter(winners)
+    monkeypatch.setattr('shadowhound_data_logger.doctor.s3._winners', lambda _: next(rounds))
+    (found,) = race_mailboxes(server)  # type: ignore[arg-type]
+    assert found.is_finding == (winners != [0, 1, 0])
 
 
 def _presigned(
