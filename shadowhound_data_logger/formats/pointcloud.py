@@ -145,8 +145,12 @@ def xyz_of(cloud: Any, every: int = 1) -> NDArray[np.float32] | None:
     points: NDArray[Any] = np.ndarray(
         (shape.height, shape.width), np.dtype(layout), buffer=cloud.data, strides=(shape.row_step, cloud.point_step)
     )
-    axes = [points[name] if every == 1 else points[name].reshape(-1)[::every] for name in names]
-    return np.stack(axes, axis=-1).reshape(-1, 3).astype(np.float32)
+    flat = points.reshape(-1)[::every]
+    columns: NDArray[np.float32] = np.empty((3, len(flat)), np.float32)  # numpy is ten times as fast along contiguous columns
+    for column, name in zip(columns, names, strict=True):
+        column[:] = flat[name]
+    table: NDArray[np.float32] = columns.T
+    return table
 
 
 def _fields(cloud: Any) -> tuple[_Field, ...]:

@@ -420,7 +420,7 @@ def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Seq
 
 def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, sizes: Sequence[int]) -> Iterator[LiveItem]:
     """These points (n, 3; float32, meters) in each requested size, without those that are not finite or absurdly far."""
-    columns = np.ascontiguousarray(table.T, '<f4')  # numpy is ten times as fast along contiguous rows
+    columns = np.ascontiguousarray(table.T, '<f4')
     low, high = _box(columns)
     if not (min(low) > -_FAR and max(high) < _FAR) or any(map(math.isnan, low)):
         is_near = (np.abs(columns) < _FAR).all(axis=0)

@@ -11,6 +11,7 @@ import itertools
 import logging
 import math
 import random
+import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -27,7 +28,7 @@ from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.live.access import TokenRefused, read_token
 from shadowhound_data_logger.live.kinds import FULL, KINDS, MAX_NAMES, LiveItem, check_jpeg
 from shadowhound_data_logger.live.panels import BULK
-from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, SMALL_LANE
+from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, BEGIN, END, PART
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +56,7 @@ _SHOWN: Final = {'topics', 'figures', 'sample', 'pong', 'message', 'problem', *_
     kind.name for kind in KINDS.values()
 )}  # fmt: skip
 _BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, DataLoggerError, TypeError, AttributeError,
-                  RecursionError)  # fmt: skip
+                  RecursionError, struct.error)  # fmt: skip
 _NOT_SIGNED_IN: Final = {
     401: 'it rejects the token: copy its viewer.token again', 429: 'too many wrong tokens came from this address',
 }  # fmt: skip
@@ -189,8 +190,8 @@ class _Connection:
         self.is_closing = False
         """Whether we close it, because there are no viewers."""
         self._parts: dict[int, bytearray] = {}
-        self._received = self._sent_topics = 0
-        self._telling: asyncio.Task[None] | None = None
+        self._received = self._acknowledged = 0
+        self._acknowledging: asyncio.Task[None] | None = None
         self._pings: deque[tuple[float, float]] = deque(maxlen=PINGS)
 
     async def read(self) -> None:
@@ -202,34 +203,29 @@ class _Connection:
                 return
             frame = message.data
             self._received += len(frame)
-            if self._received - self._sent_topics >= ACKNOWLEDGED and (self._telling is None or self._telling.done()):
-                self._telling = asyncio.create_task(self._send_topics())  # runs once the received frames are read
-            lane, flags = frame[0], frame[1]
-            if lane == SMALL_LANE:
-                self._take_several(frame)
-                continue
-            if flags & 1:
-                self._parts[lane] = bytearray()
-            part = self._parts[lane]
-            part += frame[4:]
-            if len(part) > MAX_ITEM or len(self._parts) > MAX_LANES:
-                raise ValueError('it sends more than a robot can')
-            if flags & 2:
-                self._take(bytes(self._parts.pop(lane)))
+            if self._received - self._acknowledged >= ACKNOWLEDGED and (
+                self._acknowledging is None or self._acknowledging.done()
+            ):
+                self._acknowledging = asyncio.create_task(self._acknowledge())  # runs once the received frames are read
+            place = 0
+            while place < len(frame):
+                lane, flags, length = PART.unpack_from(frame, place)
+                place += PART.size + length
+                if place > len(frame):
+                    raise ValueError('it sends less than announced')
+                if flags & BEGIN:
+                    self._parts[lane] = bytearray()
+                part = self._parts[lane]
+                part += frame[place - length : place]
+                if len(part) > MAX_ITEM or len(self._parts) > MAX_LANES:
+                    raise ValueError('it sends more than a robot can')
+                if flags & END:
+                    self._take(bytes(self._parts.pop(lane)))
 
-    async def _send_topics(self) -> None:
-        self._sent_topics = self._received
+    async def _acknowledge(self) -> None:
+        self._acknowledged = self._received
         with suppress(ConnectionError, RuntimeError):  # it has ended, as ``read`` reports
             await self.ws.send_bytes((self._received & 0xFFFF_FFFF).to_bytes(4, 'little'))
-
-    def _take_several(self, frame: bytes) -> None:
-        place = 4
-        while place < len(frame):
-            end = place + 4 + int.from_bytes(frame[place : place + 4], 'little')
-            self._take(frame[place + 4 : end])
-            place = end
-        if place != len(frame):
-            raise ValueError('it sends less than announced')
 
     def _take(self, whole: bytes) -> None:
         size = int.from_bytes(whole[:4], 'little')

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 from rclpy.node import Node
@@ -98,10 +98,10 @@ class _Sample:
 
 
 class Sampler:
-    """Samples the topics that viewers need, on the thread ``topics``. New; ``follow`` and ``step`` repeatedly; close once."""
+    """Samples the topics that viewers need. New; ``follow``, ``read`` and ``start`` repeatedly, one at a time; close once."""
 
-    def __init__(self, node: Node, descriptions: TypeDescriptions, on_items: Callable[[list[LiveItem]], None]) -> None:
-        self._node, self._descriptions, self._on_items = node, descriptions, on_items
+    def __init__(self, node: Node, descriptions: TypeDescriptions) -> None:
+        self._node, self._descriptions = node, descriptions
         self._wanted: Mapping[str, str] = {}
         self._samples: dict[str, _Sample] = {}
         self._ended_s: dict[str, float] = {}
@@ -114,28 +114,36 @@ class Sampler:
         for topic in self._samples.keys() - wanted.keys():
             self._samples.pop(topic).close()
 
-    def step(self, now_s: float) -> None:
-        """Read the current samples, and start the next one: of the topic whose last sample is the oldest."""
+    def read(self, now_s: float) -> list[LiveItem]:
+        """Read the current samples; returns those that are complete."""
+        items = []
         for topic, sample in list(self._samples.items()):
             sample.drain()
             if sample.is_complete(now_s):
                 self._samples.pop(topic).close()
-                self._end(topic, now_s, sample.figures(now_s), sample.newest(now_s))
-        if not self._wanted or len(self._samples) >= AT_ONCE or now_s < self._start_s:
-            return
+                items.append(self._ended(topic, now_s, sample.figures(now_s), sample.newest(now_s)))
+        return items
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether to start the next sample."""
+        return bool(self._wanted) and len(self._samples) < AT_ONCE and now_s >= self._start_s
+
+    def start(self, now_s: float) -> list[LiveItem]:
+        """Start the next sample: of the topic whose last sample is the oldest. Returns why it cannot be sampled."""
+        self._start_s = now_s + START_S
         ended_s = {topic: self._ended_s.get(topic, -math.inf) for topic in self._wanted if topic not in self._samples}
         topic = min(ended_s, key=ended_s.__getitem__, default='')
         if topic and now_s - ended_s[topic] >= AGAIN_S:
-            self._start_s = now_s + START_S
             is_first, type_name = topic not in self._newest, self._wanted[topic]
             try:
                 self._samples[topic] = _Sample(self._node, topic, type_name, is_first=is_first)
             except (TypeUnavailable, SubscriptionRefused) as error:
-                if unavailable(type_name) and self._descriptions.poll(topic, type_name, now_s):
-                    return  # its publisher may answer until the next start
-                self._end(topic, now_s, {'why': visible(str(error))[:300]}, None)
+                if not unavailable(type_name) or not self._descriptions.poll(topic, type_name, now_s):
+                    return [self._ended(topic, now_s, {'why': visible(str(error))[:300]}, None)]
+                # Its publisher may answer until the next start.
+        return []
 
-    def _end(self, topic: str, now_s: float, figures: Mapping[str, Any], newest: tuple[int, float] | None) -> None:
+    def _ended(self, topic: str, now_s: float, figures: Mapping[str, Any], newest: tuple[int, float] | None) -> LiveItem:
         for known in (self._ended_s, self._newest):
             if len(known) >= MAX_KNOWN:
                 known.clear()
@@ -145,7 +153,7 @@ class Sampler:
         size, newest_s = self._newest.get(topic, (None, None))
         head = {'at': round(now_s * 1e3, 1), 'of': topic, 'bytes': size,
                 'age_s': None if newest_s is None else round(now_s - newest_s, 3), **figures}  # fmt: skip
-        self._on_items([LiveItem('', 'sample', head=head)])
+        return LiveItem('', 'sample', head=head)
 
     def close(self) -> None:
         self.follow({})

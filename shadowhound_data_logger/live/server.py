@@ -39,7 +39,7 @@ from shadowhound_data_logger.live.history_process import HistoryProcess, PastUna
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.live.past_routes import PastRoutes
 from shadowhound_data_logger.live.relay import Relay
-from shadowhound_data_logger.live.viewers import SILENT_S, Graph, Viewers
+from shadowhound_data_logger.live.viewers import SILENT_S, Viewers
 from shadowhound_data_logger.spool.gaps import OBJECTS
 from shadowhound_data_logger.spool.topic_account import WRONG_TYPE
 
@@ -53,9 +53,9 @@ MAX_CONNECTIONS: Final = 200
 """Of viewers and all other clients."""
 IDLE_S: Final = 15.0
 """Between requests."""
-FIGURES_S: Final = 1.0
-LEDGER_EVERY: Final = 4
-"""The ledger, which takes several times as long to read as the status, is read with every fourth."""
+TICK_S: Final = 1.0
+FIGURES_EVERY, LEDGER_EVERY = 2, 4
+"""Ticks between two reads of the status and of the ledger, which takes twice as long."""
 CHECK_S: Final = 5.0
 """Interval of checking whether viewers are still signed in."""
 LEASE_EVERY_S: Final = 2.0
@@ -177,7 +177,7 @@ class LiveServer:
         if self._relay is not None:
             await self._relay.close()
         if self._topics is not None:
-            await asyncio.to_thread(self._topics.close)
+            await self._topics.close()
         self._pool.shutdown()
 
     @property
@@ -219,13 +219,7 @@ class LiveServer:
             return
         from shadowhound_data_logger.live.topics import Topics  # noqa: PLC0415 - rclpy
 
-        def tell(graph: Graph, total: int) -> None:
-            self._loop.call_soon_threadsafe(self.viewers.on_graph, graph, total)
-
-        def show(items: list[LiveItem]) -> None:
-            self._loop.call_soon_threadsafe(self.viewers.on_items, items)
-
-        topics = Topics(lambda: self.viewers.wanted, tell, show)
+        topics = Topics(lambda: self.viewers.wanted, self.viewers.on_graph, self.viewers.on_items)
         topics.open()
         self._topics = topics
 
@@ -237,15 +231,13 @@ class LiveServer:
     # -- once per second -------------------------------------------------------------------------------------------
 
     async def _tick(self) -> None:
-        """The status values, the sizes, the lease, and threads that ended."""
+        """The status values, the sizes and the lease."""
         rounds = 0
         lease_s = 0.0
         while True:
             began_s = time.monotonic()
             self._drop_silent()
-            if self._topics is not None:
-                self._topics.worker.poll()
-            if self.viewers.connected and not self._settings.is_of_store:
+            if self.viewers.connected and not self._settings.is_of_store and rounds % FIGURES_EVERY == 0:
                 try:
                     await self._send_figures(with_ledger=rounds % LEDGER_EVERY == 0)
                 except Exception:  # the one supervised catch-all: the page shows the age of its values
@@ -255,7 +247,7 @@ class LiveServer:
                 lease_s = began_s + LEASE_EVERY_S
                 self._loop.run_in_executor(self._pool, self.acts.lease, self._settings.uploads_mbps)
             rounds = rounds + 1 if self.viewers.connected else 0
-            await asyncio.sleep(max(0.05, began_s + FIGURES_S - time.monotonic()))
+            await asyncio.sleep(max(0.05, began_s + TICK_S - time.monotonic()))
 
     async def _send_figures(self, *, with_ledger: bool) -> None:
         def read() -> LiveItem:
@@ -265,7 +257,7 @@ class LiveServer:
 
         async with self._reading:
             item = await self._loop.run_in_executor(self._pool, read)
-        self.viewers.tell_all(item)
+        self.viewers.on_figures(item)
 
     async def _conditions(self) -> list[Condition]:
         """What alerts are about: of all robots of a store, or of this robot."""

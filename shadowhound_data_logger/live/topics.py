@@ -8,13 +8,16 @@ subscribed to as offered.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
-from typing import Final
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from typing import Final, TypeVar
 
 import rclpy
 from rclpy.node import Node
@@ -24,10 +27,10 @@ from rclpy.utilities import get_default_context
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, IMAGE
 from shadowhound_data_logger.core.untrusted import visible
-from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
-from shadowhound_data_logger.live.kinds import KINDS, Kind, LiveItem, clouds, frames, series, table_item
+from shadowhound_data_logger.live.kinds import FULL, KINDS, Kind, LiveItem, clouds, frames, series, table_item
 from shadowhound_data_logger.live.panels import Maker, kind_of, panel_of
 from shadowhound_data_logger.live.sampling import Sampler
 from shadowhound_data_logger.live.trees import numbers, parsed, tree
@@ -49,8 +52,13 @@ from shadowhound_data_logger.ros.type_descriptions import TypeDescriptions
 log = logging.getLogger(__name__)
 
 NODE: Final = 'shadowhound_live'
-POLL_S: Final = 1 / 30
+POLL_S: Final = 1 / 18
+"""What a poll costs hardly depends on what it finds: since the last one, its code has left the caches of the processor."""
 GRAPH_S: Final = 1.0
+PAUSE_S: Final = 5.0
+"""After an error."""
+LARGE_BYTES: Final = 1 << 20
+"""A larger message is converted on a thread."""
 BULK_DEPTH, ROWS_DEPTH = 2, 128
 """Depth for bulk topics, and for topics whose messages are all shown; for others only the newest is kept."""
 MAX_GATHERED: Final = 500
@@ -65,6 +73,9 @@ _Wanted = Mapping[str, frozenset[int]]
 """Watched keys (a topic, with ``#`` as a tree, with ``#path`` one of its numbers) -> the sizes."""
 _SAMPLED: Final = '#?'
 """Suffix of a key whose topic is sampled."""
+
+
+T = TypeVar('T')
 
 
 class _View:
@@ -150,20 +161,17 @@ class _Watched:
 
 
 class Topics:
-    """Reads the watched topics on the thread ``topics``, which alone creates and closes subscriptions.
+    """Reads the watched topics on the event loop, and does what takes longer (subscriptions, the graph, large images) on a
+    thread, one step at a time.
 
     New; open once; close once. ``wanted`` returns what is watched, None without viewers; ``on_graph`` is called with the topics
-    and types of the graph and their number, ``on_items`` with new items. All three are called on the thread.
+    and types of the graph and their number, ``on_items`` with new items.
     """
 
     def __init__(self, wanted: Callable[[], _Wanted | None], on_graph: Callable[[Graph, int], None],
                  on_items: Callable[[list[LiveItem]], None]) -> None:  # fmt: skip
         self._wanted, self._on_graph, self._on_items = wanted, on_graph, on_items
         self._types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        self._node: Node | None = None
-        self._sampler: Sampler | None = None
-        self._descriptions: TypeDescriptions | None = None
-        self._guard: PortGuard | None = None
         self._graph: Graph = {}
         self._total = self._counted = 0
         self._publishers: dict[str, int] = {}
@@ -172,8 +180,9 @@ class Topics:
         self._followed: _Wanted | None = None  # the server replaces it when a viewer chooses
         self._refused: dict[str, tuple[str, set[str]]] = {}
         self._problems: dict[str, str] = {}
-        self._wake = threading.Event()
-        self.worker = Worker('topics', self._step)
+        self._is_closing = False
+        self._wake = asyncio.Event()
+        self._thread = ThreadPoolExecutor(1, 'topics')
         self.rejected: dict[str, int] = {}
         """Topic -> messages that could not be shown."""
 
@@ -182,60 +191,63 @@ class Topics:
         with without_our_profile(os.environ), dead_ports_avoided(get_default_context().get_domain_id()):
             self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)
         self._descriptions = TypeDescriptions(self._node, PolledGroup())
-        self._sampler = Sampler(self._node, self._descriptions, self._on_items)
+        self._sampler = Sampler(self._node, self._descriptions)
         self._guard = PortGuard()
-        self.worker.start()
+        self._task = asyncio.create_task(self._run())
 
     def wake(self) -> None:
         """The wanted topics have changed."""
         self._wake.set()
 
-    def close(self) -> None:
-        self.worker.stop()
-        self._wake.set()
-        if not self.worker.join(5.0):
-            log.warning('the thread that reads topics does not stop')
+    async def close(self) -> None:
+        self._is_closing = True  # until Python 3.12 wait_for loses a cancellation that arrives just as it ends
+        self._task.cancel()
+        await asyncio.wait([self._task])
+        await asyncio.to_thread(self._thread.shutdown)
         for one in self._watched.values():
             one.reader.close()
-        if self._sampler is not None:
-            self._sampler.close()
-        if self._descriptions is not None:
-            self._descriptions.close()
-        if self._node is not None:
-            self._node.destroy_node()
+        self._sampler.close()
+        self._descriptions.close()
+        self._node.destroy_node()
         rclpy.try_shutdown()
-        if self._guard is not None:
-            self._guard.close()
+        self._guard.close()
 
-    # -- the thread ------------------------------------------------------------------------------------------------
+    async def _run(self) -> None:
+        while not self._is_closing:
+            try:
+                await self._step()
+            except Exception:  # a supervised catch-all: the page shows the age of what it has
+                log.exception('topics cannot be read; the next attempt is in %.0f s', PAUSE_S)
+                await asyncio.sleep(PAUSE_S)
 
-    def _step(self) -> None:
-        wanted = self._wanted()
-        if wanted:  # a sleep is cheaper than a wait, and ends soon enough
-            time.sleep(max(0.0, self._next_s - time.monotonic()))
+    async def _step(self) -> None:
+        if self._wanted():
+            await asyncio.sleep(max(0.0, self._next_s - time.monotonic()))
         else:
-            self._wake.wait(GRAPH_S)
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), GRAPH_S)
         self._wake.clear()
-        wanted = self._wanted()
-        now_s = time.monotonic()
+        wanted, now_s = self._wanted(), time.monotonic()
         self._next_s = now_s + POLL_S
-        if wanted is None:
-            self._follow({})
-            self._followed = None
-            return
-        if now_s - self._graph_s >= GRAPH_S:
+        if wanted is not None and now_s - self._graph_s >= GRAPH_S:
             self._graph_s = now_s
-            self._check_graph()
+            if await self._on_thread(self._check_graph):
+                self._on_graph(self._graph, self._total)
             self._followed = None
         if wanted is not self._followed:
-            self._follow(wanted)
+            self._on_items(await self._on_thread(lambda: self._follow(wanted or {})))
             self._followed = wanted
-        self._drain(wanted, now_s)
-        assert self._sampler is not None
-        self._sampler.step(now_s)
+        if wanted:
+            await self._drain(wanted, now_s)
+            self._on_items(self._sampler.read(now_s))
+            if self._sampler.is_due(now_s):
+                self._on_items(await self._on_thread(lambda: self._sampler.start(now_s)))
 
-    def _check_graph(self) -> None:
-        assert self._node is not None
+    async def _on_thread(self, do: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._thread, do)
+
+    def _check_graph(self) -> bool:
+        """Whether it has changed."""
         seen = {topic: types for topic, types in self._node.get_topic_names_and_types() if types}
         counted = [topic for topic in seen if topic not in self._publishers]
         known = [topic for topic in self._publishers if topic in seen]
@@ -255,14 +267,13 @@ class Topics:
         ]
         rows.sort(key=lambda row: (row[2] < 1, kind_of(row[0], row[1]) is None, row[0]))
         graph = {topic: (type_name, count) for topic, type_name, count in rows[:MAX_TOPICS]}
-        if graph != self._graph or len(rows) != self._total:
-            self._graph, self._total = graph, len(rows)
-            self._on_graph(graph, len(rows))
+        before = self._graph, self._total
+        self._graph, self._total = graph, len(rows)
+        return before != (graph, len(rows))
 
-    def _follow(self, wanted: _Wanted) -> None:
-        assert self._node is not None
-        assert self._sampler is not None
-        assert self._descriptions is not None
+    def _follow(self, wanted: _Wanted) -> list[LiveItem]:
+        """Subscribe to exactly these; returns why others are not shown."""
+        items: list[LiveItem] = []
         sampled = (key.removesuffix(_SAMPLED) for key in wanted if key.endswith(_SAMPLED))
         self._sampler.follow({topic: self._graph[topic][0] for topic in sampled if topic in self._graph})
         topics: dict[str, set[str]] = {}
@@ -286,11 +297,13 @@ class Topics:
                         continue  # its publisher may answer until the next check of the graph
                     self._refused[topic] = type_name, keys
                     log.warning('%s is not shown: %s', topic, error)
-                    self._on_items([item for key in sorted(keys) for item in self._problem(key, str(error))])
+                    items += [item for key in sorted(keys) for item in self._problem(key, str(error))]
+        return items
 
-    def _drain(self, wanted: _Wanted, now_s: float) -> None:
+    async def _drain(self, wanted: _Wanted, now_s: float) -> None:
         items: list[LiveItem] = []
-        for topic, one in self._watched.items():
+        slow: list[tuple[str, _Watched, _View, list[Taken], list[int]]] = []
+        for one in self._watched.values():
             if not one.is_due(now_s):
                 continue
             received = one.reader.drain(one.most)
@@ -301,17 +314,26 @@ class Topics:
                 sizes = wanted.get(key, frozenset())
                 if not taken or not sizes:
                     continue
-                try:
-                    items += self._items(key, one, view, taken, sorted(sizes))
-                    if key in self._problems:
-                        items += self._problem(key, '')
-                except Rejected as error:
-                    self.rejected[topic] = self.rejected.get(topic, 0) + 1
-                    if self.rejected[topic] == 1:
-                        log.warning('%s: a message cannot be shown: %s', topic, error)
-                    items += self._problem(key, str(error))
-        if items:
-            self._on_items(items)
+                shown = key, one, view, taken, sorted(sizes)
+                if len(taken[-1].cdr) > LARGE_BYTES or one.type == IMAGE or (one.type == COMPRESSED_IMAGE and max(sizes) > FULL):
+                    slow.append(shown)
+                else:
+                    items += self._shown(*shown)
+        self._on_items(items)
+        for shown in slow:
+            self._on_items(await self._on_thread(partial(self._shown, *shown)))
+
+    def _shown(self, key: str, one: _Watched, view: _View, taken: list[Taken], sizes: list[int]) -> list[LiveItem]:
+        """Its items, or why it cannot be shown."""
+        try:
+            items = self._items(key, one, view, taken, sizes)
+        except Rejected as error:
+            topic = one.reader.plan.topic
+            self.rejected[topic] = self.rejected.get(topic, 0) + 1
+            if self.rejected[topic] == 1:
+                log.warning('%s: a message cannot be shown: %s', topic, error)
+            return self._problem(key, str(error))
+        return items + self._problem(key, '') if key in self._problems else items
 
     def _problem(self, key: str, why: str) -> list[LiveItem]:
         """Report why a watched topic is not shown, when that changes; empty: it is shown again."""

@@ -1,13 +1,15 @@
 """What is sent to one browser, in which order, and never more than its link can carry.
 
-A frame of the WebSocket is a byte with its lane, a byte of flags (1: an item starts, 2: it ends), two unused bytes, and a part
-of an item (``kinds.LiveItem.packed``); on lane 0 it is several complete items, each after a uint32 with its length. Each
-browser reports how many bytes of frames it has received, as a uint32 that wraps: after 2 KB or more, once for everything that
-arrived together. At most a window of bytes is in flight; what waits is small, or the newest of its topic.
+A frame of the WebSocket has parts of items (``kinds.LiveItem.packed``): complete small ones on lane 0, then at most one part of a
+large one. Each is a byte with its lane, a byte of flags (1: an item starts, 2: it ends), two unused bytes, a uint32 with its
+length, and that many bytes. Each browser reports how many bytes of frames it has received, as a uint32 that wraps: after 2 KB or
+more, once for everything that arrived together. At most a window of bytes is in flight; what waits is small, or the newest of its
+topic.
 """
 
 from __future__ import annotations
 
+import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -20,16 +22,18 @@ MIN_QUEUE, MAX_QUEUE = 12 << 10, 160 << 10
 """Bytes that may be queued on the link, in addition to those in flight."""
 QUEUE_S: Final = 0.04
 """Duration of the queue, within these bounds."""
-MIN_CHUNK, MAX_CHUNK = 4 << 10, 64 << 10
-"""Size of a frame with a part of a large item: on a slow link small items wait for a smaller one."""
+MIN_CHUNK, MAX_CHUNK = 4 << 10, 256 << 10
+"""Size of a part of a large item: on a slow link small items wait for a smaller one."""
 CHUNK_S: Final = QUEUE_S / 3
 SMALL_FRAME: Final = 4 << 10
-"""Size of a frame with small items; the next frame has the rest."""
+"""Size of the small items in a frame; the next frame has the rest."""
 SMALL_ROOM: Final = 8 << 10
 """Small items may exceed the window by this much: they do not wait for the acknowledgment of a large one."""
 MAX_ROWS_WAITING: Final = 12
 """Items of a series, each of some 33 ms; older ones are dropped."""
 SMALL_LANE: Final = 0
+PART: Final = struct.Struct('<BB2xI')
+"""The head of a part: lane, flags, length."""
 OWN: Final = frozenset({'', 'figures', 'topics'})
 """Slots of items that every viewer gets."""
 ACKNOWLEDGED: Final = 2 << 10
@@ -120,6 +124,11 @@ class Viewer:
             self._rows.setdefault(item.topic, deque(maxlen=MAX_ROWS_WAITING)).append(item)
 
     @property
+    def is_waiting(self) -> bool:
+        """Whether something has not been sent yet."""
+        return bool(self._rows or self._slots or self._lanes)
+
+    @property
     def window(self) -> int:
         """Bytes that may be sent without acknowledgment: a full round trip, and a short queue."""
         rate = self._share
@@ -136,10 +145,15 @@ class Viewer:
         under_way, window = self._sent - self._acked, self.window
         if under_way >= window + SMALL_ROOM:
             return None
-        if self._rows:
-            return self._small()
+        parts = self._small()
         is_videos_turn = self.has_video and self._now() < self._bulk_s
-        return self._bulk() if under_way < window and not is_videos_turn else None
+        if under_way < window and not is_videos_turn:
+            parts += self._bulk(sum(map(len, parts)))
+        if not parts:
+            return None
+        frame = b''.join(parts)
+        self._sent += len(frame)
+        return frame
 
     def acknowledge(self, received: int) -> None:
         """The browser has received this many bytes, modulo 2^32. Impossible numbers are ignored."""
@@ -165,22 +179,25 @@ class Viewer:
             fitting = [size for size in SIZES if self._bytes[topic] * SMALLER[size] * (UP if size < now else 1.0) <= room]
             self._sizes[topic] = min(fitting, default=SMALLEST)
 
-    def _small(self) -> bytes:
+    def _small(self) -> list[bytes | memoryview]:
         """From each topic in turn the item that has waited longest."""
-        frame = bytearray((SMALL_LANE, BEGIN | END, 0, 0))
-        while self._rows and len(frame) < SMALL_FRAME:
+        parts: list[bytes | memoryview] = []
+        size = 0
+        while self._rows and size < SMALL_FRAME:
             topic = next(iter(self._rows))
             rows = self._rows.pop(topic)
             packed = rows.popleft().packed
-            frame += len(packed).to_bytes(4, 'little') + packed
+            parts += PART.pack(SMALL_LANE, BEGIN | END, len(packed)), packed
+            size += PART.size + len(packed)
             if rows:
                 self._rows[topic] = rows  # the others have their turn first
-        return self._count(bytes(frame))
+        return parts
 
-    def _bulk(self) -> bytes | None:
+    def _bulk(self, ahead: int) -> list[bytes | memoryview]:
+        """A part of the bulk item whose turn it is; ``ahead``: bytes before it in the frame."""
         waiting = {*self._slots, *self._lanes}
         if not waiting:
-            return None
+            return []
         topic = min(waiting, key=lambda name: (max(self._used.get(name, 0.0), self._virtual), name))
         lane = self._lanes.get(topic)
         flags = 0
@@ -189,7 +206,7 @@ class Viewer:
             lane = self._lanes[topic] = _Lane(self._free_lane(), body)
             flags = BEGIN
             if len(body) >= MIN_MEASURED and not self.has_video:
-                self._measured.append((self._sent + len(body), self._sent, self._acked, self._now()))
+                self._measured.append((self._sent + ahead + len(body), self._sent, self._acked, self._now()))
         part = lane.body[lane.at : lane.at + int(min(max(self._share * CHUNK_S, MIN_CHUNK), MAX_CHUNK))]
         lane.at += len(part)
         self._bulk_s = max(self._bulk_s, self._now()) + len(part) / self._share if self.has_video else 0.0
@@ -198,12 +215,8 @@ class Viewer:
         if lane.at >= len(lane.body):
             flags |= END
             del self._lanes[topic]
-        return self._count(bytes((lane.number, flags, 0, 0)) + part)
+        return [PART.pack(lane.number, flags, len(part)), part]
 
     def _free_lane(self) -> int:
         taken = {lane.number for lane in self._lanes.values()}
         return next(number for number in range(1, 256) if number not in taken)
-
-    def _count(self, frame: bytes) -> bytes:
-        self._sent += len(frame)
-        return frame

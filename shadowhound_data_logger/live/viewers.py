@@ -92,6 +92,7 @@ class Viewers:
         self.ros_problem = ''
         """Why only the data is shown; empty if topics are read."""
         self._relayed_topics: LiveItem | None = None
+        self._figures: LiveItem | None = None
         self._rewatching: asyncio.TimerHandle | None = None
         self._rewatched_s = 0.0
 
@@ -112,6 +113,8 @@ class Viewers:
             one.transport = request.transport
             one.viewer.round_s = _round_s(one.transport)
             self._offer_topics(one)
+            if self._figures is not None and len(self.connected) > 1:  # the first viewer is sent new ones at once
+                one.tell(self._figures)
             self.rewatch()
             one.tasks = [asyncio.create_task(self._receive(one)), asyncio.create_task(_send(one))]
             await asyncio.wait(one.tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -147,7 +150,9 @@ class Viewers:
 
     # -- what they are sent ----------------------------------------------------------------------------------------
 
-    def tell_all(self, item: LiveItem) -> None:
+    def on_figures(self, item: LiveItem) -> None:
+        """New values of the status and the ledger."""
+        self._figures = item
         for one in self.connected:
             one.tell(item)
 
@@ -256,7 +261,8 @@ class Viewers:
             one.received_s = time.monotonic()
             if message.type == WSMsgType.BINARY and len(message.data) == 4:
                 one.viewer.acknowledge(int.from_bytes(message.data, 'little'))
-                one.ready.set()
+                if one.viewer.is_waiting:
+                    one.ready.set()
             elif message.type == WSMsgType.TEXT:
                 self._take(one, parsed(message.data))
             elif message.type in (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, BEGIN, END, SMALL_LANE
+from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, BEGIN, END, PART
 
 
 class Frames:
@@ -19,12 +19,16 @@ class Frames:
     def take(self, frame: bytes) -> list[tuple[dict[str, Any], bytes]]:
         """Head and body of each item that this frame completes."""
         self.bytes += len(frame)
-        lane, flags = frame[:2]
-        if lane == SMALL_LANE:
-            return [opened(item) for item in _several(frame[4:])]
-        assert bool(flags & BEGIN) is (lane not in self._parts)
-        self._parts[lane] = self._parts.get(lane, b'') + frame[4:]
-        return [opened(self._parts.pop(lane))] if flags & END else []
+        found, place = [], 0
+        while place < len(frame):
+            lane, flags, length = PART.unpack_from(frame, place)
+            place += PART.size + length
+            assert bool(flags & BEGIN) is (lane not in self._parts)
+            self._parts[lane] = self._parts.get(lane, b'') + frame[place - length : place]
+            if flags & END:
+                found.append(opened(self._parts.pop(lane)))
+        assert place == len(frame)
+        return found
 
     def acknowledgement(self) -> bytes | None:
         """The acknowledgement to send now, if any."""
@@ -32,15 +36,6 @@ class Frames:
             return None
         self._told = self.bytes
         return (self.bytes & 0xFFFF_FFFF).to_bytes(4, 'little')
-
-
-def _several(content: bytes) -> list[bytes]:
-    found = []
-    while content:
-        end = 4 + int.from_bytes(content[:4], 'little')
-        found.append(content[4:end])
-        content = content[end:]
-    return found
 
 
 def opened(item: bytes) -> tuple[dict[str, Any], bytes]:

@@ -546,7 +546,7 @@ def test_a_frame_of_a_gigabyte_is_refused_by_its_header(tmp_path: Path, monkeypa
 
 def test_frequent_changes_of_a_viewer_rarely_change_subscriptions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each change creates and removes subscriptions, which is discovered by the whole network of the robot."""
-    monkeypatch.setattr(module, 'FIGURES_S', 3600.0)
+    monkeypatch.setattr(module, 'TICK_S', 3600.0)
 
     async def run() -> None:
         async with (

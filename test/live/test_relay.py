@@ -23,6 +23,7 @@ from shadowhound_data_logger.live import access, relay, server
 from shadowhound_data_logger.live.access import make_tokens
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
+from shadowhound_data_logger.live.viewer import BEGIN, END, PART
 
 CAMERA, IMU = '/camera', '/imu'
 GRAPH = {CAMERA: (COMPRESSED_IMAGE, 1), IMU: ('sensor_msgs/msg/Imu', 1)}
@@ -279,32 +280,36 @@ def test_a_viewer_during_disconnect_sees_the_robot_immediately() -> None:
     asyncio.run(run())
 
 
-WHOLE, SEVERAL = b'\x01\x03\x00\x00', b'\x00\x03\x00\x00'
+def whole(content: bytes) -> bytes:
+    """A complete large item."""
+    return PART.pack(1, BEGIN | END, len(content)) + content
+
+
 CLOUD = {'at': 1.0, 'points': 0, 'low': [0.0] * 3, 'step': [1.0] * 3, 'frame': 'odom'}
 NAN = b'{"topic":"","kind":"figures","at":1.0,"figures":{"topics":[],"rate":NaN}}'
-PONG = WHOLE + LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed
+PONG = whole(LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed)
 
 
 @pytest.mark.parametrize('said', [
-    b'', b'\x00\x03', b'\x01\x02\x00\x00ab', SEVERAL + b'\xff\xff\xff\x7f' + PONG[4:], SEVERAL + bytes(5),
-    WHOLE + b'\xff' * 99, WHOLE + b'\x02\x00\x00\x00[]',
-    WHOLE + LiveItem('', 'pong', head={'ping': 'x', 'now': {}}).packed, WHOLE + LiveItem('', 'topics', head={'topics': 7}).packed,
-    WHOLE + LiveItem('/a', 'script', head={'at': 1}).packed, WHOLE + b'\xff\xff\xff\x7f{}',
-    WHOLE + b'\xff\xff\x00\x00' + b'[' * 0xFFFF, WHOLE + len(NAN).to_bytes(4, 'little') + NAN, *(
-        WHOLE + LiveItem('', 'figures', head={'at': 1.0, 'figures': figures}).packed
-        for figures in (None, 7, {}, {'topics': 7}, {'topics': [7]}, {'topics': [{'topic': {}, 'type': ''}]})
-    ),
-    *(WHOLE + LiveItem('', 'sample', head={'at': 1.0, **head}).packed for head in ({}, {'of': 7}, {'of': '/a', 'hz': {}})),
-    *(
-        WHOLE + LiveItem('/a', 'cloud', head={**CLOUD, **changed}).packed
-        for changed in ({'points': 10**9}, {'low': [math.nan] * 3}, {'low': []}, {'step': [1.0, 1.0, math.inf]}, {'frame': 7})
-    ),
-    *(
-        WHOLE + LiveItem('/a', 'imu', head={'at': 1.0, 'rows': rows, 'names': names}).packed
-        for rows, names in ((1, ['x']), (0, ['x'] * 999), (0, [7]), (0, 'x'))
-    ),
-    WHOLE + LiveItem('/a', 'camera', head={'at': 1.0}, body=b'no jpeg').packed,
-    WHOLE + LiveItem('/a', 'camera', head={'at': 1.0}, body=of_too_many_pixels()).packed,
+    b'\x00\x03', PART.pack(1, END, 2) + b'ab', PONG[:-1], PONG + PART.pack(0, BEGIN | END, 0x7FFF_FFFF), whole(b''),
+    *map(whole, (
+        b'\xff' * 99, b'\x02\x00\x00\x00[]', b'\xff\xff\xff\x7f{}', b'\xff\xff\x00\x00' + b'[' * 0xFFFF,
+        len(NAN).to_bytes(4, 'little') + NAN,
+        *(item.packed for item in (
+            LiveItem('', 'pong', head={'ping': 'x', 'now': {}}), LiveItem('', 'topics', head={'topics': 7}),
+            LiveItem('/a', 'script', head={'at': 1}),
+            *(LiveItem('', 'figures', head={'at': 1.0, 'figures': figures})
+              for figures in (None, 7, {}, {'topics': 7}, {'topics': [7]}, {'topics': [{'topic': {}, 'type': ''}]})),
+            *(LiveItem('', 'sample', head={'at': 1.0, **head}) for head in ({}, {'of': 7}, {'of': '/a', 'hz': {}})),
+            *(LiveItem('/a', 'cloud', head={**CLOUD, **changed})
+              for changed in ({'points': 10**9}, {'low': [math.nan] * 3}, {'low': []}, {'step': [1.0, 1.0, math.inf]},
+                              {'frame': 7})),
+            *(LiveItem('/a', 'imu', head={'at': 1.0, 'rows': rows, 'names': names})
+              for rows, names in ((1, ['x']), (0, ['x'] * 999), (0, [7]), (0, 'x'))),
+            LiveItem('/a', 'camera', head={'at': 1.0}, body=b'no jpeg'),
+            LiveItem('/a', 'camera', head={'at': 1.0}, body=of_too_many_pixels()),
+        )),
+    )),
 ])  # fmt: skip
 def test_an_invalid_robot_page_is_reported(tmp_path: Path, said: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     """The page of the store continues, and shows why there is no live view."""

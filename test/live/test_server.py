@@ -151,7 +151,7 @@ def test_video_is_suggested_on_a_link_that_stays_narrow(tmp_path: Path) -> None:
 
 def test_a_page_on_a_narrow_link_is_notified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It gets frames that exceed the link, and after a while the suggestion."""
-    monkeypatch.setattr(module, 'FIGURES_S', 0.05)
+    monkeypatch.setattr(module, 'TICK_S', 0.05)
     monkeypatch.setattr(viewers_module, 'NARROW_S', 0.3)
 
     async def run() -> dict[str, Any]:

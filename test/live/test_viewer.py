@@ -19,6 +19,7 @@ from shadowhound_data_logger.live.viewer import (
     MAX_ROWS_WAITING,
     MIN_CHUNK,
     MIN_QUEUE,
+    PART,
     SMALL_FRAME,
     SMALL_ROOM,
     SMALLER,
@@ -43,7 +44,7 @@ class Browser:
         before = len(self.items)
         while most and (frame := self.viewer.next_frame()) is not None:
             most -= 1
-            assert len(frame) <= MAX_CHUNK + 4
+            assert len(frame) <= MAX_CHUNK + SMALL_FRAME + 4 * PART.size
             self.items += [{**head, 'body': body} for head, body in self._frames.take(frame)]
         return self.items[before:]
 
@@ -176,7 +177,7 @@ def test_an_acknowledgement_of_what_was_not_sent_opens_no_window(browser: Browse
     before = browser.received
     browser.viewer.acknowledge(said)
     browser.read()
-    assert browser.received - before <= MAX_CHUNK + 4
+    assert browser.received - before <= MAX_CHUNK + PART.size
 
 
 def test_topics_that_are_no_longer_watched_are_not_sent(browser: Browser) -> None:
@@ -270,7 +271,7 @@ def test_with_video_large_items_get_a_share_of_the_link(now: list[float]) -> Non
     link.carried = 0
     link.late_s.clear()
     link.run(10.0)
-    assert viewer.rate == rate
+    assert viewer.rate == pytest.approx(rate, rel=0.01)  # one item was under way when the video began
     assert viewer.window < before / 3
     assert link.carried < 10 * rate * BESIDE_VIDEO * 1.3
     viewer.has_video = False
@@ -280,14 +281,14 @@ def test_with_video_large_items_get_a_share_of_the_link(now: list[float]) -> Non
     assert link.carried > 10 * rate * BESIDE_VIDEO * 2
 
 
-@pytest.mark.parametrize(('rate', 'chunk'), [(5e6, MAX_CHUNK), (60_000.0, MIN_CHUNK), (FIRST_RATE, int(FIRST_RATE * CHUNK_S))])
+@pytest.mark.parametrize(('rate', 'chunk'), [(5e7, MAX_CHUNK), (60_000.0, MIN_CHUNK), (FIRST_RATE, int(FIRST_RATE * CHUNK_S))])
 def test_a_piece_of_a_large_item_does_not_keep_a_link_for_long(browser: Browser, rate: float, chunk: int) -> None:
     """The next item waits 13 ms, unless the link is slower than the supported minimum."""
     browser.viewer.rate = rate
-    browser.viewer.offer(frame(1))
+    browser.viewer.offer(frame(1, 400_000))
     sent = browser.viewer.next_frame()
     assert sent is not None
-    assert len(sent) == chunk + 4
+    assert len(sent) == chunk + PART.size
 
 
 def test_with_video_frames_of_large_items_are_sized_by_their_share(browser: Browser) -> None:
@@ -296,7 +297,7 @@ def test_with_video_frames_of_large_items_are_sized_by_their_share(browser: Brow
     browser.viewer.offer(frame(1))
     sent = browser.viewer.next_frame()
     assert sent is not None
-    assert len(sent) == int(4e6 * BESIDE_VIDEO * CHUNK_S) + 4
+    assert len(sent) == int(4e6 * BESIDE_VIDEO * CHUNK_S) + PART.size
 
 
 def test_small_items_are_sent_while_a_window_is_full(browser: Browser) -> None:

@@ -1,8 +1,8 @@
 // The connection to the robot: frames to items, acknowledgements, the offset of its clock, and coming back after an outage.
 //
-// A frame is a byte with its lane, a byte of flags (1: an item begins, 2: it ends), two of nothing, and a part of an item; on lane 0
-// whole items, each after a uint32 with its length. An item is a uint32 with the length of its head, the head as JSON padded to eight
-// bytes, and its body.
+// A frame has parts of items. Each is a byte with its lane, a byte of flags (1: an item begins, 2: it ends), two unused bytes, a uint32
+// with its length, and that many bytes. An item is a uint32 with the length of its head, the head as JSON padded to eight bytes, and
+// its body.
 
 const SILENT_MS = 3000; // the robot says something each second
 const ACKNOWLEDGED = 2048; // bytes, at least, between two acknowledgements
@@ -111,21 +111,23 @@ export class Link {
         isTelling = true;
         telling.port2.postMessage(null);
       }
-      const [lane, flags] = new Uint8Array(data, 0, 2);
-      if (lane === 0) return this.takeSeveral(data);
-      if (flags & 1) parts.set(lane, []);
-      const known = parts.get(lane);
-      if (!known) return;
-      known.push(new Uint8Array(data, 4));
-      if (flags & 2) {
-        parts.delete(lane);
-        const whole = new Uint8Array(known.reduce((sum, part) => sum + part.length, 0));
-        let at = 0;
-        for (const part of known) {
-          whole.set(part, at);
-          at += part.length;
+      const view = new DataView(data);
+      for (let at = 0; at < data.byteLength; at += 8 + view.getUint32(at + 4, true)) {
+        const [lane, flags] = new Uint8Array(data, at, 2);
+        if (flags & 1) parts.set(lane, []);
+        const known = parts.get(lane);
+        if (!known) continue;
+        known.push(new Uint8Array(data, at + 8, view.getUint32(at + 4, true)));
+        if (flags & 2) {
+          parts.delete(lane);
+          const whole = new Uint8Array(known.reduce((sum, part) => sum + part.length, 0));
+          let end = 0;
+          for (const part of known) {
+            whole.set(part, end);
+            end += part.length;
+          }
+          this.take(whole);
         }
-        this.take(whole);
       }
     };
     socket.onclose = () => {
@@ -134,11 +136,6 @@ export class Link {
       this.socket = null;
       this.onState('lost');
     };
-  }
-
-  takeSeveral(frame) {
-    const view = new DataView(frame);
-    for (let at = 4; at < frame.byteLength; at += 4 + view.getUint32(at, true)) this.take(new Uint8Array(frame, at + 4, view.getUint32(at, true)));
   }
 
   take(whole) {
