@@ -102,6 +102,7 @@ MAX_OFFSETS: Final = 8
 """Offsets between stamp and arrival, in the messages around a moment."""
 MAX_CUTS: Final = 3
 """Maximum commands that cut a bag."""
+MAX_DATASET: Final = 60
 MAX_COLUMNS: Final = 64
 MAX_MESSAGES: Final = 2000
 """Of a series at a moment; and of one object."""
@@ -621,14 +622,25 @@ def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: st
         for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MAX_CUTS]
     ]
     exports = [
-        ['export', f'shadowhound-data export lerobot {shlex.quote(mission)} {of} --mission {shlex.quote(mission)}']
-        for mission in [mission for mission in dict.fromkeys(missions) if is_name(mission)][:MAX_CUTS]
+        ['export', f'shadowhound-data export lerobot {_dataset(mission)} {of} --mission {shlex.quote(mission)}']
+        for mission in [mission for mission in dict.fromkeys(missions) if _is_readable(mission)][:MAX_CUTS]
     ]
     if by == BY_RECEIVED:
         return [['query', f'shadowhound-data query {span} --by {by}'], *cuts]
     pulls = [['pull', f'shadowhound-data pull {span}']] if is_kept else []
     fetch = ['fetch', f'shadowhound-data fetch {span} --to data']
     return [['query', f'shadowhound-data query {span}'], fetch, *cuts, *exports, *pulls]
+
+
+def _is_readable(name: str) -> bool:
+    """Whether an operator can check it in a command line: on one line, and not truncated."""
+    return bool(name) and len(name) <= MAX_TEXT and visible(name) == name
+
+
+def _dataset(mission: str) -> str:
+    """A name for the dataset of a mission."""
+    name = re.sub(r'[^A-Za-z0-9_]+', '_', mission).strip('_')[:MAX_DATASET]
+    return mission if is_name(mission) else name or 'mission'
 
 
 def _is_new(offset_ns: int, known: Iterable[int]) -> bool:

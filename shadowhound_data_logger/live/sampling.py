@@ -26,8 +26,10 @@ AGAIN_S: Final = 5.0
 SAMPLE_S: Final = 2.0
 SILENT_S: Final = 3.0
 """Duration without a message: on a busy machine a publisher may match the subscription a second late."""
-SLOW_S: Final = 4.5
-"""Duration while fewer than ``FEW`` messages have arrived, but at least one."""
+HEARD_SILENT_S: Final = 6.0
+"""The same for a topic with earlier messages: it may match three seconds late, and one at 1 Hz would be shown as silent."""
+SLOW_S: Final = 3.5
+"""Duration after the first message while fewer than ``FEW`` have arrived: a topic at 0.5 Hz sends two."""
 FEW: Final = 3
 ENOUGH, ENOUGH_S = 100, 0.5
 """A sample with this many messages ends after this time."""
@@ -48,6 +50,7 @@ class _Sample:
         offered = endpoints(node, topic)
         self.is_latched = bool(offered) and all(each.reliable and each.transient_local for each in offered)
         keeps = self.is_latched and is_first
+        self._silent_s = SILENT_S if is_first or self.is_latched else HEARD_SILENT_S
         depth = LARGE_DEPTH if type_name in LARGE_TYPES else DEPTH
         self._began_s, self._began_ns = time.monotonic(), time.time_ns()
         self._reader = Reader(node, Plan(topic, type_name, reliable=keeps, transient_local=keeps, depth=depth), PolledGroup())
@@ -65,8 +68,10 @@ class _Sample:
 
     def is_complete(self, now_s: float) -> bool:
         took_s, count = now_s - self._began_s, len(self._arrivals)
+        if not count:
+            return took_s >= self._silent_s
         return (
-            took_s >= (SAMPLE_S if count >= FEW else SLOW_S if count else SILENT_S)
+            (took_s >= SAMPLE_S and (count >= FEW or (time.time_ns() - self._arrivals[0]) / 1e9 >= SLOW_S))
             or (took_s >= ENOUGH_S and count >= ENOUGH)
             or (count >= ENOUGH_LARGE and sum(self._sizes) >= ENOUGH_BYTES)
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 from lake.gap_parts import lost, mark, tell
 from lake.making import DAY_NS, NOON_NS, add_part, folder_store, row
-from live.browsing import CHROMIUM, HOSTILE, Served, fits, holds, opened
+from live.browsing import CHROMIUM, HOSTILE, Served, fits, holds, opened, press
+from live.test_history import MISSION
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.options import UploadSettings
@@ -98,14 +100,25 @@ def test_the_table_of_robots_is_ordered_and_leads_to_each(browser: Browser, home
         page.close()
 
 
-NAMES = ('\u202egnp.exe', '\x1b]0;title\x07\x00', 'mission ' * 1250, '\u05d0\u05d1 \u0627\u0628', f'"><{HOSTILE}', '${7*7}')
+NAMES = (
+    '\u202egnp.exe',
+    '\x1b]0;title\x07\x00',
+    'mission ' * 1250,
+    MISSION,
+    '\u05d0\u05d1 \u0627\u0628',
+    f'"><{HOSTILE}',
+    '${7*7}',
+)
 """Mission names: text that changes the direction or moves a cursor, 10 kB, right-to-left words, code."""
 
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
 def test_hostile_names_of_missions_are_text(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the table of robots, on the timeline and in the list of missions they are text on one line, truncated if long."""
+    """In the table of robots, on the timeline, in the list of missions and in commands: on one line, truncated if long.
+
+    Commands quote them for a shell; what is copied is the text that is shown.
+    """
     now_ns = time.time_ns() - 60 * SECOND
     with closing(open_store(folder_store(home), UploadSettings())) as store:
         for place, name in enumerate(NAMES):
@@ -120,8 +133,17 @@ def test_hostile_names_of_missions_are_text(browser: Browser, home: Path, monkey
         holds(page, f'document.querySelectorAll("tr[data-state]:not([data-state=unknown])").length === {len(NAMES) + 1}')
         shown = page.locator('[data-mark=mission]').evaluate_all('all => all.map(one => one.dataset.name)')
         assert all(name.isprintable() and len(name) < 500 for name in shown)
-        assert {NAMES[3], NAMES[4], NAMES[5]} <= set(shown)
+        assert {*NAMES[3:]} <= set(shown)
         assert all(each.isprintable() for each in page.locator('body').inner_text().split())
+        page.get_by_label('Of which time').select_option('range')
+        exports = page.locator('[data-command=export]')
+        exports.first.wait_for()
+        lines = [shlex.split(line) for line in exports.all_text_contents()]
+        assert [line[line.index('--mission') + 1] for line in lines] == list(NAMES[3:6])
+        page.context.grant_permissions(['clipboard-read', 'clipboard-write'])
+        press(page.locator('p:has(> [data-command=export]) button').first)
+        holds(page, "navigator.clipboard.readText().then(text => text.includes('--mission'))")
+        assert page.evaluate('navigator.clipboard.readText()') == exports.first.text_content()
         page.get_by_label('Mission', exact=True).select_option('2')
         page.evaluate('document.querySelectorAll("details").forEach(each => { each.open = true; })')
         for width in (1280, 390):

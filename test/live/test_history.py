@@ -7,6 +7,7 @@ import json
 import os
 import shlex
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -47,6 +48,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 IMU = 'sensor_msgs/msg/Imu'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 HOSTILE = '<img src=x onerror=alert(1)>$(reboot)\x1b[31m'
+MISSION = '$(touch attacked)\'";<img src=x onerror=alert(1)>'
 
 
 def jpeg(shade: int) -> bytes:
@@ -624,6 +626,30 @@ def test_the_commands_for_a_time_run(store: ObjectStore, opened: Opened, tmp_pat
     exported = ran(f'{lines["export"]} --dry-run', tmp_path / 'there')
     assert exported.return_value in {0, 1}
     assert 'm1' in exported.output
+
+
+@pytest.mark.parametrize('mission', ['-rf', "it's <b>", MISSION, '日本 $HOME `id`', 'a;b|c&d>e'])
+def test_the_export_of_a_mission_of_any_name(store: ObjectStore, opened: Opened, tmp_path: Path, mission: str) -> None:
+    """Its name is quoted: a shell runs no part of it, and the command finds the mission."""
+    add_part(store, [object_row(1, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg', mission_id=mission)], 'a', tmp_path / 'tmp')
+    noon = NOON_NS // 1_000_000
+    found = opened(StorePast()).answer({'do': 'range', 'robot': 'thor', 'from': noon, 'to': noon + 5000})[0]
+    line = dict(found['commands'])['export']
+    command = f'shadowhound-data() {{ printf "%s\\0" "$@"; }}; {line}'
+    typed = subprocess.run(['bash', '-c', command], capture_output=True, text=True, check=True, cwd=tmp_path, timeout=60)
+    assert typed.stderr == ''
+    words = typed.stdout.split('\0')[:-1]
+    assert words[words.index('--mission') + 1] == mission
+    assert not (tmp_path / 'attacked').exists()
+    exported = ran(f'{line} --dry-run', tmp_path)
+    assert exported.return_value in {0, 1}
+    assert '1 waiting' in exported.output, exported.output
+
+
+def test_no_command_has_a_name_that_cannot_be_read() -> None:
+    """Text that changes lines, direction or is truncated on the page is not offered to be pasted into a shell."""
+    hidden = ['a\nb', 'a\x1b[2Kb', 'a\u202eb', 'm' * 10_000, '']
+    assert commands('thor', 0, SECOND, [], missions=hidden) == commands('thor', 0, SECOND, [])
 
 
 def test_the_command_pulls_kept_data(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:

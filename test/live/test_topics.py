@@ -355,6 +355,36 @@ def test_a_latched_topic_has_no_rate(tmp_path: Path, monkeypatch: pytest.MonkeyP
     run(tmp_path, monkeypatch, doing)
 
 
+def test_a_slow_topic_has_a_rate_though_it_matches_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic at 1 Hz whose publisher is busy for the first four seconds of a sample, like the diagnostics of a busy robot."""
+    from std_msgs.msg import Float32
+
+    async def doing(robot: Robot) -> None:
+        publisher = robot.node.create_publisher(Float32, '/slow', 1)
+        now_s = asyncio.get_running_loop().time
+        due_s, late_s = 0.0, 0.0
+
+        def publish() -> bool:
+            """Once per second while it has a subscription, after this delay."""
+            nonlocal due_s
+            if not publisher.get_subscription_count():
+                due_s = now_s() + late_s
+            elif now_s() >= due_s:
+                publisher.publish(Float32())
+                due_s = max(now_s(), due_s) + 1.0
+            return '/slow' in tab.samples
+
+        async with robot.tab() as tab:
+            await tab.watch('/slow#?')
+            for late_s in (0.0, 4.0):
+                await until(publish, f'it is sampled, {late_s} s late')
+                sample = tab.samples.pop('/slow')
+                assert sample['hz'] is not None, (late_s, sample)
+                assert 0.7 < sample['hz'] < 1.3, (late_s, sample)
+
+    run(tmp_path, monkeypatch, doing)
+
+
 def test_why_a_topic_cannot_be_sampled_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Once for all viewers, and the others are sampled."""
     from shadowhound_data_logger.live import sampling

@@ -223,7 +223,7 @@ function Guarded({ of, children }) {
 const hint = signal('');
 const noHover = matchMedia('(hover: none)');
 document.addEventListener('click', (event) => {
-  const of = noHover.matches && !event.target.closest('button, a, input, select, summary') && event.target.closest('dt, dd, th, td, p, span, b, small')?.closest('[title]');
+  const of = noHover.matches && !event.target.closest('button, a, input, select, summary') && event.target.closest('[title]');
   hint.value = of && of.title !== hint.value ? of.title : '';
 });
 
@@ -243,9 +243,9 @@ function App() {
     <main class=${past.value ? 'past' : connection.value === 'connected' || !who.has_live ? '' : 'stale'}>
       <section id="now" aria-label="Now">${who.waits && (!past.value || !who.has_live) && html`<p class="banner" data-waits>${who.waits}</p>`}${problem.value && !past.value && html`<p class="banner">${problem.value}</p>`}
         ${!past.value && who.has_live && told && html`<${Glance} session=${who} figures=${told} onSignIn=${open} />`}<${Views} drawn=${drawn} /></section>
-      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} now=${present} session=${who} />
+      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2 title="The topics of the robot, what the node records of them, and how much of it has reached the store">The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} now=${present} session=${who} />
         <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div></${Guarded}>` : html`<p class="empty">…</p>`}</section>`}
-      <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} session=${who} /></section>
+      <section id="gaps" aria-label="Gaps"><h2 title="Messages that were published and will not be in the store, with the time and the cause">What is missing</h2><${Timeline} session=${who} /></section>
     </main>
     ${hint.value && html`<p class="hint" role="status">${hint.value}</p>`}
     <dialog ref=${box}><${SignIn} box=${box} onDone=${done} /></dialog>`;

@@ -80,7 +80,7 @@ function sampling(own, figures) {
 function sampledRate(own) {
   if (own?.hz) return own.hz.toFixed(1);
   if (!own?.sampled || own.why) return '–';
-  return own.latched && own.bytes !== null ? 'latched' : '< 0.5';
+  return own.latched && own.bytes !== null ? 'latched' : own.messages ? '< 0.5' : 'none';
 }
 
 // At the end of its sample; what sent nothing in it ages on.
@@ -121,10 +121,10 @@ export function TopicTable({ figures, now }) {
     if (name === 'missed' && row.missed === null && row.missed_estimated !== null) return html`~${digits(row.missed_estimated)}`;
     return digits(row[name]);
   };
-  return html`<div class="panel topics-panel"><div class="panel-head"><h3>Topics</h3>${rows.length > SEARCHED && html`<input type="search" aria-label="Search topics and types" placeholder=${`search ${rows.length} topics`} value=${wanted} onInput=${(event) => setWanted(event.target.value)} />`}
+  return html`<div class="panel topics-panel"><div class="panel-head"><h3 title="All topics of the robot: those that the node records, with its counts since it first ran, and others, of which this page takes samples">Topics</h3>${rows.length > SEARCHED && html`<input type="search" aria-label="Search topics and types" placeholder=${`search ${rows.length} topics`} value=${wanted} onInput=${(event) => setWanted(event.target.value)} />`}
       <span class=${`verdict ${figures.balanced ? 'good' : 'bad'}`} title="Whether, for each topic, received = stored + skipped + rejected + dropped + open">${figures.balanced === null ? '' : figures.balanced ? 'the ledger balances' : 'the ledger does not balance'}</span></div>
     <div class="scroll"><table class="topics" ref=${box}>
-      <thead><tr><th><span class="visually-hidden">State</span></th><th title="A click shows the newest message">Topic</th>${COLUMNS.map(([, label, what]) => html`<th class="n" title=${what}>${label}</th>`)}</tr></thead>
+      <thead><tr><th title="Whether the topic is recorded without losses; each mark explains itself"><span class="visually-hidden">State</span></th><th title="A click shows the newest message">Topic</th>${COLUMNS.map(([, label, what]) => html`<th class="n" title=${what}>${label}</th>`)}</tr></thead>
       <tbody>${shown.map((row) => {
         const [kind, why] = state(row);
         const isOpen = inspected.value === row.topic;
@@ -170,16 +170,16 @@ export function Cards({ figures }) {
   const isFine = ['idle', 'shipping', 'not_draining', 'waiting'].includes(store?.state);
   const sending = store?.mbps ? html`${store.mbps.toFixed(1)} Mbit/s${store.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}` : 'nothing now';
   return html`<div class="cards">
-    <div class="panel card"><h3>Delivery to the store</h3><p class="big" data-field="store" title="What the node does with objects that are ready: sending, waiting for a rule, or trying again"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
+    <div class="panel card"><h3 title="How objects are uploaded from the robot’s disk to the S3 store">Delivery to the store</h3><p class="big" data-field="store" title="What the node does with objects that are ready: sending, waiting for a rule, or trying again"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
       <dl><${Row} name="to" field="target" what="The store that objects are sent to">${store?.target || '–'}</${Row}><${Row} name="sends" field="mbps" what="The rate of uploads now, and its limit">${sending}</${Row}>
       <${Row} name="delivered" what="Objects that the store has confirmed since the node first ran"><span data-field="delivered">${digits(objects?.delivered)}</span> objects</${Row}></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}${rules.map(([name, why]) => html`<p class="note watch" data-field="waits-for" title=${`The setting ${name} delays uploads`}>waits for ${why}</p>`)}</div>
-    <div class="panel card"><h3>Waiting for delivery</h3><p class="big" data-field="waiting" title="Objects on the robot’s disk that the store does not have yet">${digits(waiting)} <small>objects</small></p>
+    <div class="panel card"><h3 title="Data that was recorded and is only on the robot’s disk until the store has confirmed it">Waiting for delivery</h3><p class="big" data-field="waiting" title="Objects on the robot’s disk that the store does not have yet">${digits(waiting)} <small>objects</small></p>
       <dl><${Row} name="size" field="waiting-bytes" what="The bytes of the objects that wait">${volume(bytes)}</${Row}><${Row} name="delivered in" field="left" what="When all of them will be in the store, at the rate of the last seconds">${arrival(waiting, store)}</${Row}>
       <${Row} name="oldest" field="oldest" what="How long the oldest of them has been waiting">${spool?.oldest_age_s ? span(spool.oldest_age_s) : '–'}</${Row}></dl></div>
-    <div class="panel card"><h3>Robot’s disk (spool)</h3><p class="big" data-field="spool-bytes" title="Bytes of all objects on the robot’s disk: those that wait, and those that are kept">${volume(spool?.bytes)}</p>
+    <div class="panel card"><h3 title="The folder on the robot to which each object is written before it is sent">Robot’s disk (spool)</h3><p class="big" data-field="spool-bytes" title="Bytes of all objects on the robot’s disk: those that wait, and those that are kept">${volume(spool?.bytes)}</p>
       <${Bar} part=${spool?.bytes ?? 0} whole=${spool?.max_bytes} label="How full the spool is" />
       <dl><${Row} name="limit" field="spool-limit" what="spool.max_bytes: when it is reached, the least important objects are deleted, and the ledger lists them">${volume(spool?.max_bytes)}</${Row}><${Row} name="disk has free" field="free" what="Free space on the disk that the spool is on">${volume(spool?.free_bytes)}</${Row}><${Row} name="in quarantine" field="quarantined" what="Objects that the store refused; they stay on the robot, with the reason: shadowhound-data spool list">${digits(spool?.quarantined)}</${Row}></dl></div>
-    <div class="panel card"><h3>Memory (queue)</h3><p class="big" data-field="queue" title="Messages in memory that are not encoded and not on the disk yet">${digits(queue?.messages)} <small>messages</small></p>
+    <div class="panel card"><h3 title="Messages between their arrival and the disk; what is in memory is lost if the node crashes">Memory (queue)</h3><p class="big" data-field="queue" title="Messages in memory that are not encoded and not on the disk yet">${digits(queue?.messages)} <small>messages</small></p>
       <${Bar} part=${queue?.messages ?? 0} whole=${queue?.max_messages} label="How full the queue is" />
       <dl><${Row} name="size" field="queue-bytes" what="The bytes of these messages">${volume(queue?.bytes)}</${Row}><${Row} name="mission" field="mission" what="The mission that is running">${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</${Row}>${figures.mission?.policy ? html`<${Row} name="policy" field="policy" what="The policy that this mission runs">${figures.mission.policy}</${Row}>` : ''}<${Row} name="bag" field="bag" what="The bag that is being recorded">${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</${Row}></dl></div>
   </div>`;
@@ -207,10 +207,10 @@ export function Findings({ figures }) {
   const [isAll, setIsAll] = useState(false);
   const { state: asked, results, error } = doctor.value;
   const wrong = results.filter((each) => ['warning', 'error'].includes(each.severity));
-  return html`<div class="panel"><div class="panel-head"><h3>Findings</h3><button type="button" title="Checks the robot, its node, its network and its store; takes up to a minute" onClick=${examine} disabled=${asked === 'asking'}>${asked === 'asking' ? 'The doctor is checking…' : 'Run the doctor'}</button></div>
+  return html`<div class="panel"><div class="panel-head"><h3 title="What needs attention, as the node reports it, and what the doctor finds">Findings</h3><button type="button" title="Checks the robot, its node, its network and its store; takes up to a minute" onClick=${examine} disabled=${asked === 'asking'}>${asked === 'asking' ? 'The doctor is checking…' : 'Run the doctor'}</button></div>
     ${figures.findings.length ? html`<ul class="findings">${figures.findings.slice(0, isAll ? undefined : MOST_FINDINGS).map((text) => html`<li><${Mark} kind="watch" why="finding" /><span>${text}</span></li>`)}</ul>${!isAll && figures.findings.length > MOST_FINDINGS && html`<button type="button" onClick=${() => setIsAll(true)}>Show all ${figures.findings.length}</button>`}`
       : html`<p class="empty good">Nothing needs attention.</p>`}
-    ${asked === 'told' && html`<div class="doctor" aria-live="polite"><h4>The doctor</h4>
+    ${asked === 'told' && html`<div class="doctor" aria-live="polite"><h4 title="The result of the checks that were started here">The doctor</h4>
       ${error ? html`<p class="note bad">${error}</p>` : !wrong.length ? html`<p class="good">${results.length} checks, no problem found.</p>`
       : html`<ul class="findings">${wrong.map((each) => html`<li><${Mark} kind=${each.severity === 'error' && !isLate(each) ? 'bad' : 'watch'} why=${isLate(each) ? 'not known: the check did not end in time' : each.severity} />
         <span><b>${isLate(each) ? `Not known (${each.check.split('.')[0]}): ${each.seen}` : each.seen}</b>${each.cause ? html`<br />${each.cause}` : ''}${each.remedy ? html`<br /><code>${each.remedy}</code>` : ''}</span></li>`)}</ul>`}</div>`}
@@ -253,16 +253,16 @@ export function Controls({ session, figures, onSignIn }) {
   const [name, setName] = useState('');
   const [note, setNote] = useState('');
   if (session.role !== 'operator') {
-    return html`<div class="panel controls"><div class="panel-head"><h3>Missions, bags, events</h3></div><p class="empty">You can watch. To trigger events and record bags, sign in with the operator’s token.</p>
+    return html`<div class="panel controls"><div class="panel-head"><h3 title="Commands to the node; only an operator may give them">Missions, bags, events</h3></div><p class="empty">You can watch. To trigger events and record bags, sign in with the operator’s token.</p>
       <button type="button" class="primary" onClick=${onSignIn}>Sign in as operator</button></div>`;
   }
   const button = (do_, label, kind = '') => html`<button type="button" class=${kind} disabled=${Boolean(busy.value)} onClick=${() => act(session, do_)} data-act=${do_} title=${ACTS[do_]}>${busy.value === do_ ? '…' : label}</button>`;
-  return html`<div class="panel controls"><div class="panel-head"><h3>Missions, bags, events</h3><span class="unit">you are an operator</span></div>
+  return html`<div class="panel controls"><div class="panel-head"><h3 title="Commands to the node; the ledger records who gave them">Missions, bags, events</h3><span class="unit">you are an operator</span></div>
     <form class="row" onSubmit=${(event) => { event.preventDefault(); act(session, 'event', { name: name || 'manual', ...(note ? { note } : {}) }); }}>
       <input aria-label="Name of the event" placeholder="what happened" maxlength="100" value=${name} onInput=${(event) => setName(event.target.value)} />
       <input aria-label="Note" placeholder="a note" maxlength="1000" value=${note} onInput=${(event) => setNote(event.target.value)} />
       <button class="primary" disabled=${Boolean(busy.value)} data-act="event" title="Keeps what the robot recorded around this moment, at its full rate">${busy.value === 'event' ? '…' : 'Save this moment'}</button></form>
-    <div class="row"><span class="row-name">Bag</span>${button('bag start', 'Start')}${button('bag split', 'Split')}${button('bag stop', 'Stop')}</div>
-    <div class="row"><span class="row-name">Node</span>${button('flush', 'Flush')}${figures.paused ? button('resume', 'Resume', 'primary') : button('pause', 'Pause')}</div>
+    <div class="row"><span class="row-name" title="A recording of all messages of some topics, as MCAP files">Bag</span>${button('bag start', 'Start')}${button('bag split', 'Split')}${button('bag stop', 'Stop')}</div>
+    <div class="row"><span class="row-name" title="The program that records on the robot">Node</span>${button('flush', 'Flush')}${figures.paused ? button('resume', 'Resume', 'primary') : button('pause', 'Pause')}</div>
     <ol class="answers" aria-live="polite">${answers.value.map((each) => html`<li class=${each.ok ? '' : 'bad'}><time>${each.at}</time> <b>${each.do}</b> ${each.text}</li>`)}</ol></div>`;
 }

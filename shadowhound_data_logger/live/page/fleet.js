@@ -25,8 +25,8 @@ export function Fleet({ chosen, names }) {
   if (failed) return html`<div class="panel fleet"><p class="note bad" role="alert">${failed}</p></div>`;
   const now = Date.now();
   const ago = (ms) => (ms === null ? '–' : `${span(Math.max(0, now - ms) / 1000)} ago`);
-  return html`<div class="panel fleet"><div class="panel-head"><h3>Robots</h3><span class="unit">what needs a look is first</span></div><div class="scroll"><table>
-    <thead><tr><th><span class="visually-hidden">State</span></th><th>Robot</th><th title="When the newest message in the store came to the robot">Last contact</th><th title="The last mission in the store, and when it started">Last mission</th>
+  return html`<div class="panel fleet"><div class="panel-head"><h3 title="All robots that have delivered to this store">Robots</h3><span class="unit">what needs a look is first</span></div><div class="scroll"><table>
+    <thead><tr><th title="Whether the robot needs a look; each mark explains itself"><span class="visually-hidden">State</span></th><th title="A click shows what this robot recorded last">Robot</th><th title="When the newest message in the store came to the robot">Last contact</th><th title="The last mission in the store, and when it started">Last mission</th>
       <th class="n" title="Messages that are known to be lost since midnight, UTC">Missing today</th><th title="Up to here the robot has reported what is missing. What is newer still waits on the robot.">Known until</th></tr></thead>
     <tbody>${(rows ?? names.map(unknown)).map((row) => html`<tr key=${row.robot} class=${row.robot === chosen ? 'shown' : ''} data-robot=${row.robot} data-state=${rows ? row.state : 'unknown'}><td><${Mark} kind=${row.state} why=${row.why} /></td>
       <td><button type="button" class="link" onClick=${() => openRobot(row.robot)}>${row.robot}</button><small> ${row.state === 'good' ? '' : row.why}</small></td>

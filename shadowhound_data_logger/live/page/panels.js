@@ -44,9 +44,23 @@ function FullScreen() {
   return document.fullscreenEnabled && html`<button type="button" class="icon" onClick=${toggle} aria-label="Full screen" title="Full screen; Escape ends it"><svg width="13" height="13" viewBox="0 0 13 13" aria-hidden="true"><path d="M1 4.5V1h3.5M8.5 1H12v3.5M12 8.5V12H8.5M4.5 12H1V8.5" fill="none" stroke="currentColor" stroke-width="1.6" /></svg></button>`;
 }
 
+const TITLES = {
+  Camera: 'The newest frame of this topic, as the camera’s driver publishes it (CompressedImage or Image)',
+  '3D view': 'The robot and what its sensors measure around it: points, scans and the map, placed by the transforms of /tf; in meters',
+  Path: 'Where the robot went, seen from above, by its odometry or by /tf, on its map or on what its lidar measured; in meters',
+  GPS: 'Where the robot went by its satellite receiver (NavSatFix), north up',
+  Attitude: 'Roll, pitch and yaw in degrees, from the orientation that the IMU reports',
+  Acceleration: 'Acceleration along the three axes of the IMU, in m/s²; it includes gravity',
+  Joints: 'The angles of all joints in radians, as the robot publishes them',
+  Battery: 'Charge in percent and voltage in volts of the last ten minutes, as the robot reports them',
+  Temperature: 'Temperatures of the last ten minutes in °C, as the robot reports them',
+  Diagnostics: 'The state of each part of the robot, as its programs report it (DiagnosticArray); errors are first',
+  Log: 'What the programs of the robot log (/rosout); the newest line is first',
+};
+
 export function Panel({ title, kind, of, className = '', tools, choice = true, children }) {
   const found = choice ? having(kind).filter((row) => isLiving(row) || row[0] === chosen(kind)) : [];
-  return html`<section class=${`panel view ${className}`} aria-label=${title}><div class="panel-head"><h3>${title}</h3>
+  return html`<section class=${`panel view ${className}`} aria-label=${title}><div class="panel-head"><h3 title=${TITLES[title]}>${title}</h3>
     ${found.length > 1 && html`<select aria-label=${`Topic of ${title}`} value=${chosen(kind)} onChange=${(event) => pick(kind, event.target.value)}>
       ${found.map(([topic]) => html`<option>${topic}</option>`)}</select>`}
     ${tools}<${Age} kind=${kind} of=${of ?? kind} /></div>${children}</section>`;
@@ -133,7 +147,7 @@ export function OtherCamera({ topic }) {
     frames.show(head, body);
   });
   const end = () => change({ cameras: layout.value.cameras.filter((each) => each !== topic) });
-  return html`<section class="panel view camera other" aria-label=${`Camera ${topic}`}><div class="panel-head"><h3 title=${topic}>${topic}</h3><${FullScreen} />
+  return html`<section class="panel view camera other" aria-label=${`Camera ${topic}`}><div class="panel-head"><h3 title=${`The newest frame of ${topic}`}>${topic}</h3><${FullScreen} />
     <button type="button" class="icon" onClick=${end} aria-label=${`Close ${topic}`} title="Close">×</button><${Age} kind="camera" of=${`camera:${topic}`} /></div>
     <div class="stage"><canvas ref=${canvas} width="640" height="480" role="img" aria-label=${`The newest frame of ${topic}`}></canvas><${Why} kind="camera" topic=${topic} /><${Scale} topic=${topic} /></div></section>`;
 }
@@ -264,7 +278,7 @@ export function NumberPlot({ of }) {
   const value = ring.last()[path];
   const end = () => change({ plots: layout.value.plots.filter((each) => each !== of) });
   const why = problems.value[of] || (!past.value && topics.value.length && !(topics.value.find(([name]) => name === topic)?.[3] > 0) ? `Nobody publishes ${topic} now.` : '');
-  return html`<section class="panel view chart number" aria-label=${`${path} of ${topic}`} data-plot=${of}><div class="panel-head"><h3 title=${`${topic} ${path}`}>${path} <small>${topic}</small></h3>
+  return html`<section class="panel view chart number" aria-label=${`${path} of ${topic}`} data-plot=${of}><div class="panel-head"><h3 title=${`The value of ${path} in the messages of ${topic}, over the last minute`}>${path} <small>${topic}</small></h3>
     <button type="button" class="icon" onClick=${end} aria-label=${`Close the plot of ${path}`} title="Close">×</button>${!why && html`<${Age} kind="field" of=${of} />`}</div>
     <div class="legend small"><span><i class="stroke line-1"></i><b data-value title=${`${path} of ${topic}, the newest value`}>${value === undefined ? '–' : Number.isFinite(value) ? String(Number(value.toPrecision(6))) : String(value)}</b></span></div>
     <div class="plot" ref=${box}></div>${why && html`<p class="why" data-why=${of}>${why}</p>`}</section>`;
@@ -292,8 +306,8 @@ export function Gps() {
   const { lat, lat_rest, lon, lon_rest, altitude, status, error } = ringOf('fix').last();
   const has = Number.isFinite(lat) && Number.isFinite(lon);
   return html`<${Panel} title="GPS" kind="fix" className="plan gps" tools=${html`<${FullScreen} />`}><div class="legend small">
-    <span>latitude <b data-field="lat" title="Degrees north, WGS 84">${has ? (lat + lat_rest).toFixed(7) : '–'}</b></span><span>longitude <b data-field="lon" title="Degrees east, WGS 84">${has ? (lon + lon_rest).toFixed(7) : '–'}</b></span>
-    <span title="Above the WGS 84 ellipsoid">altitude <b>${Number.isFinite(altitude) ? altitude.toFixed(1) : '–'}</b> m</span><span>${status === undefined ? '' : FIXES[status] ?? `status ${status}`}${Number.isFinite(error) ? ` ±${error.toFixed(1)} m` : ''}</span></div>
+    <span title="Degrees north, WGS 84">latitude <b data-field="lat">${has ? (lat + lat_rest).toFixed(7) : '–'}</b></span><span title="Degrees east, WGS 84">longitude <b data-field="lon">${has ? (lon + lon_rest).toFixed(7) : '–'}</b></span>
+    <span title="Above the WGS 84 ellipsoid">altitude <b>${Number.isFinite(altitude) ? altitude.toFixed(1) : '–'}</b> m</span><span title="What the receiver reports about its position, and the standard deviation of its longitude in meters, if it reports one">${status === undefined ? '' : FIXES[status] ?? `status ${status}`}${Number.isFinite(error) ? ` ±${error.toFixed(1)} m` : ''}</span></div>
     <div class="stage"><canvas ref=${canvas} role="img" aria-label="Where the robot went by GPS, north up"></canvas>${session.value.tiles && html`<small class="attribution">map: ${new URL(session.value.tiles.replaceAll(/[{}]/g, '')).host}</small>`}</div><${Why} kind="fix" /></${Panel}>`;
 }
 

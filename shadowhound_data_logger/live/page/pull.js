@@ -72,7 +72,7 @@ export function Pull({ session, robot, selected }) {
   const chosen = sensors.includes(sensor) ? sensor : sensors[0];
   const found = kept[chosen];
   const lost = Object.entries(found?.lost ?? {});
-  return html`<div class="pull"><div class="panel-head"><h3>Kept on the robot</h3><span class="unit">${clock(from)} for ${span((to - from) / 1000)}</span></div>
+  return html`<div class="pull"><div class="panel-head"><h3 title="Data of the selected time that the robot does not send unless it is requested">Kept on the robot</h3><span class="unit">${clock(from)} for ${span((to - from) / 1000)}</span></div>
     ${found && html`<div class="row"><select aria-label="Sensor" value=${chosen} onChange=${(event) => setSensor(event.target.value)}>${sensors.map((name) => html`<option>${name}</option>`)}</select>
       <span data-offer=${found.objects} title="What the robot keeps of this sensor in this time, and how long sending it takes">${digits(found.objects)} objects, ${volume(found.bytes)}${found.seconds === null ? '' : `, ${span(found.seconds)} at ${found.mbps.toFixed(1)} Mbit/s`}</span>
       ${lost.length > 0 && html`<span class="note bad">${lost.map(([reason, count]) => `${count} lost (${reason})`).join(', ')}</span>`}

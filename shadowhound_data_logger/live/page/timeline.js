@@ -101,11 +101,16 @@ function Piece({ session, robot, bag, size, from, to }) {
     }
   };
   const address = made && new URL(made.path, location.href).href;
-  return html`<p class="download" data-bag=${bag}><span class="row-name">bag</span><span>${bag} <span class="unit">${made ? html`${digits(made.messages)} messages, ${volume(made.bytes)}, ${span(made.seconds)}${made.seconds < (to - from) / 1000 - 2 ? ` of the ${span((to - from) / 1000)}: the rest is not in the closed files of the bag` : ''}; the links work for 15 minutes` : `the files of this time have ${volume(size)}`}</span>
+  return html`<p class="download" data-bag=${bag}><span class="row-name" title="A bag that was recorded in this time">bag</span><span>${bag} <span class="unit">${made ? html`${digits(made.messages)} messages, ${volume(made.bytes)}, ${span(made.seconds)}${made.seconds < (to - from) / 1000 - 2 ? ` of the ${span((to - from) / 1000)}: the rest is not in the closed files of the bag` : ''}; the links work for 15 minutes` : `the files of this time have ${volume(size)}`}</span>
       ${state && state !== 'cutting…' && html` <span class="note bad" role="alert">${state}</span>`}</span>
     ${made ? html`<span class="links"><a class="button" data-piece href=${made.path} download>Download MCAP</a>${VIEWERS.map(([name, link]) => html`<a class="button" data-viewer=${name} target="_blank" rel="noopener" href=${link + encodeURIComponent(address)}>${name}</a>`)}</span>`
       : html`<button type="button" data-cut=${bag} disabled=${state === 'cutting…'} onClick=${cut}>${state === 'cutting…' ? state : 'Cut as MCAP'}</button>`}</p>`;
 }
+
+const COMMANDS = {
+  query: 'Lists the objects of this time in the store', fetch: 'Downloads them into the folder data', 'bag cut': 'Makes a bag of this time from the files of a bag in the store, in the folder cut',
+  export: 'Makes a LeRobot dataset from the mission', pull: 'Requests what only the robot has of this time',
+};
 
 // The commands of a time, as they can be pasted into a shell; the bags that have it can be downloaded here.
 function Commands({ session, robot, selected }) {
@@ -126,13 +131,13 @@ function Commands({ session, robot, selected }) {
   }, [robot, from, to, chosen, shownBy.value]);
   const commands = chosen === 'moment' ? past.value.commands : found?.commands ?? [];
   const bags = chosen === 'moment' ? [] : found?.bags ?? [];
-  return html`<div class="commands"><div class="panel-head"><h3>Get this data: commands and bags</h3><select aria-label="Of which time" value=${chosen} onChange=${(event) => setWhat(event.target.value)}>
+  return html`<div class="commands"><div class="panel-head"><h3 title="Commands for a terminal that get the data of this time from the store, and bags that can be downloaded here">Get this data: commands and bags</h3><select aria-label="Of which time" value=${chosen} onChange=${(event) => setWhat(event.target.value)}>
       ${selected && html`<option value="selection">the selected ${span((to - from) / 1000)}</option>`}
       <option value="moment">5 s around this moment</option><option value="minute">the minute around this moment</option><option value="range">all that the timeline shows</option></select></div>
     ${failed && html`<p class="note bad" role="alert">${failed}</p>`}
     ${bags.map(([bag, size, start, end]) => html`<${Piece} key=${`${bag} ${start} ${end}`} session=${session} robot=${robot} bag=${bag} size=${size} from=${start} to=${end} />`)}
     ${chosen !== 'moment' && found && !bags.length && html`<p class="note">No bag was recorded in this time, so there is none to cut; fetch gets its objects.</p>`}
-    ${commands.map(([name, line]) => html`<p key=${line}><span class="row-name">${name}</span><code data-command=${name}>${line}</code><${Copy} text=${line} /></p>`)}</div>`;
+    ${commands.map(([name, line]) => html`<p key=${line}><span class="row-name" title=${COMMANDS[name]}>${name}</span><code data-command=${name}>${line}</code><${Copy} text=${line} /></p>`)}</div>`;
 }
 
 function Transport({ robot, begin, setBegin, jump }) {
@@ -421,7 +426,7 @@ export function Timeline({ session }) {
 
   return html`${isPast && robots.value.length > 1 && html`<${Fleet} chosen=${robot} names=${robots.value} />`}<div class="panel timeline">
     <div class="panel-head">
-      <h3>${isPast ? 'Back in time' : minutes ? `The last ${span((to - from) / 1000)}` : 'Today'} <span class="unit">UTC</span></h3>
+      <h3 title=${isPast ? 'What was recorded and what is missing, by topic and time' : 'What is missing, by topic and time'}>${isPast ? 'Back in time' : minutes ? `The last ${span((to - from) / 1000)}` : 'Today'} <span class="unit">UTC</span></h3>
       ${isPast && html`${robots.value.length > 1 && html`<select aria-label="Robot" value=${robot} onChange=${(event) => openRobot(event.target.value)}>${robots.value.map((each) => html`<option>${each}</option>`)}</select>`}
         <select aria-label="Day" value=${range.value ? new Date(Math.max(0, range.value.from)).toISOString().slice(0, 10) : ''} onChange=${(event) => openDay(robot, event.target.value)}>
           ${days.value.map((each) => html`<option>${each}</option>`)}</select>
@@ -489,8 +494,8 @@ export function Timeline({ session }) {
       <p class="row"><button type="button" onClick=${() => show(chosen)}>Show the moment before</button>${isPast && html`<button type="button" onClick=${() => { setBegin(null); selection.value = { from: chosen.from, to: chosen.to }; }}>Select this time</button>`}</p></${GapWords}>`}
     ${late && html`<p class="chosen" aria-live="polite" data-late-words>Recorded ${clock(late[0])} to ${clock(late[1])}, ${late[2] === null ? 'and some of it still waits on the robot' : html`and delivered until ${clock(late[2])}, up to ${span((late[2] - late[0]) / 1000)} later`}: the store could not be reached then, or uploads had to wait. It waited on the robot's disk; what is lost is drawn as a gap.</p>`}
     ${isPast && html`<${Commands} session=${session} robot=${robot} selected=${selected} />`}
-    ${gaps.length > 0 && html`<details><summary>${gaps.length === 1 ? 'The gap' : `All ${gaps.length} gaps`} as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
-      <th class="n">Messages</th><th>What</th><th>Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td><button type="button" class="link" onClick=${() => show(gap)}>${clock(gap.from)}</button></td>
+    ${gaps.length > 0 && html`<details><summary>${gaps.length === 1 ? 'The gap' : `All ${gaps.length} gaps`} as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th title="The topic whose messages are missing">Topic</th><th title="The start of the gap, UTC; a click shows the moment before">From</th><th class="n" title="How long the gap is">For</th>
+      <th class="n" title="How many messages are missing; an estimate if they are not numbered">Messages</th><th title="Where they were lost: missed on the way to the node; dropped or rejected in it; evicted from its disk, or in quarantine there">What</th><th title="Why they are missing">Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td><button type="button" class="link" onClick=${() => show(gap)}>${clock(gap.from)}</button></td>
       <td class="n">${span((gap.to - gap.from) / 1000)}</td><td class="n">${digits(gap.count)}</td><td>${gap.kind}</td><td title=${gap.cause}>${meaning(gap.cause)}</td></tr>`)}</tbody></table></div></details>`}
   </div>${isPast && !session.has_live && robots.value.length === 1 && html`<${Fleet} chosen=${robot} names=${robots.value} />`}`;
 }

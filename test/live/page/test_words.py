@@ -22,8 +22,11 @@ from shadowhound_data_logger.live.server import LiveSettings
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, CDPSession, Page
 
-FIGURES = 'main :is([data-field], dd, td.n, td.figure, .big, .legend b, [data-value], [data-offer], [role=meter])'
-UNDEFINED = f"""[...document.querySelectorAll('{FIGURES}')].filter((each) => !each.closest('.list, .gaps-table, .tree')
+FIGURES = (
+    'main :is([data-field], dd, td.n, td.figure, .big, .legend b, [data-value], [data-offer], [role=meter],'
+    ' h2, h3, h4, th, .row-name)'
+)
+UNDEFINED = f"""[...document.querySelectorAll('{FIGURES}')].filter((each) => !each.closest('.list .rows, .gaps-table td, .tree')
     && !(each.closest('[title]')?.title.length > 8)).map((each) => each.outerHTML.slice(0, 120))"""
 FIX, BATTERY = 'sensor_msgs/msg/NavSatFix', 'go2_interfaces/msg/LowState'
 
@@ -61,11 +64,21 @@ def undefined(page: Page) -> list[str]:
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
-def test_every_figure_of_the_live_page_has_a_definition(browser: Browser, robot: Served) -> None:
-    """As the tooltip of the value, or of its container."""
+def test_every_figure_of_the_live_page_has_a_definition(browser: Browser, robot: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the tooltip of the value, or of its container; so has each title of a panel, head of a column and card."""
+
+    async def doctor(*_: Any) -> dict[str, Any]:
+        return {'doctor': {'results': []}}
+
+    monkeypatch.setattr('shadowhound_data_logger.live.acts._doctor', doctor)
     page = opened(browser, robot.server.url)
     holds(page, 'shadowhound.count.fix > 3 && document.querySelectorAll("[data-field=policy]").length === 1')
-    assert page.evaluate(f"document.querySelectorAll('{FIGURES}').length") > 40
+    page.locator('.menu input').evaluate_all('all => { for (const one of all) if (!one.checked) one.click(); }')
+    holds(page, 'document.querySelectorAll(".views h3").length === document.querySelectorAll(".menu input").length + 1')
+    press(page.get_by_role('button', name='Run the doctor'))
+    page.locator('.doctor h4').wait_for()
+    assert page.locator('.gaps-table th').count() == 6
+    assert page.evaluate(f"document.querySelectorAll('{FIGURES}').length") > 60
     assert undefined(page) == []
     page.close()
 
@@ -83,6 +96,9 @@ def test_every_figure_of_the_past_has_a_definition(browser: Browser, tmp_path: P
         with Served(settings, monkeypatch) as served:
             page = opened(browser, served.server.url)
             holds(page, 'document.querySelectorAll("tr[data-robot]:not([data-state=unknown])").length === 4')
+            page.get_by_label('Of which time').select_option('range')
+            holds(page, '["query", "fetch"].every(name => document.querySelector(`[data-command=${name}]`))')
+            assert page.locator('.fleet th, .commands .row-name, .pull h3').count() > 7
             assert undefined(page) == []
             page.close()
 
