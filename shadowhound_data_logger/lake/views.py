@@ -19,7 +19,7 @@ from shadowhound_data_logger.formats.rows.catalog import FORGOTTEN, OBJECTS, Tab
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import fresh, ingest, known_files, pending, unknown_of
+from shadowhound_data_logger.lake.ingest import KnownFile, fresh, ingest, known_files, pending, unknown_of
 from shadowhound_data_logger.lake.row_files import Scope, row_files
 from shadowhound_data_logger.lake.tables import INGESTED, TABLES, Tables, answer, engine, literal
 
@@ -40,11 +40,11 @@ def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robo
     of = tuple(dict.fromkeys((*of, FORGOTTEN))) if OBJECTS in of else tuple(of)
     scope = Scope(of, robot, has_date)
     tables = current(source, scope, findings) if as_of is None else Tables.of(source)
-    ingested = tables.open(INGESTED)
+    ingested = tables.open(INGESTED) if tables.is_shared and as_of is None else None  # before the tables that it describes
     opened = {each: tables.open(TABLES[each.folder], as_of) for each in of}
     found: dict[str, Any] = {f'{TABLES[each.folder].name}{_TABLE}': table for each, table in opened.items()}
     empty = {each for each, table in opened.items() if not table.file_uris()}
-    if tables.is_shared and as_of is None:
+    if ingested is not None:
         files = pending(ingested, row_files(source, findings, scope))
         for each in {file.of for file in files}:
             rows = fresh(source, files, opened[each], each, findings)
@@ -87,15 +87,18 @@ def dates(source: Bucket, robot: str, of: Sequence[TableSchema], findings: Findi
 def current(source: Bucket, scope: Scope, findings: Findings) -> Tables:
     """The tables of a store; local ones contain all row files of the scope. Reports the rejected rows of these files."""
     tables = Tables.of(source)
-    if not tables.is_shared:
-        _catch_up(source, tables, scope, findings)
-    for bad in known_files(tables.open(INGESTED), scope, 'rejected > 0'):
+    known = (known_files(tables.open(INGESTED), scope, 'rejected > 0') if tables.is_shared
+             else _catch_up(source, tables, scope, findings))  # fmt: skip
+    for bad in (each for each in known if each.rejected):
         findings.add(bad.part, bad.why or 'rows of it are rejected', bad.rejected)
     return tables
 
 
-def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) -> None:
-    """Ingest the files that local tables lack. If the store lost files that they contain, rebuild them: it is another store."""
+def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) -> list[KnownFile]:
+    """Ingest the files that local tables lack; returns all files of the scope that are in them.
+
+    If the store lost files that they contain, rebuild them: it is another store.
+    """
     tables.create()
     opened = tables.open(INGESTED)  # before the listing: files that another process ingests later must not seem lost
     files, known = row_files(source, findings, scope), known_files(opened, scope)
@@ -103,7 +106,10 @@ def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) 
         tables.delete_local()
         tables.create()
         known = []
-    ingest(source, tables, findings, unknown_of(files, known))
+    if not (unknown := unknown_of(files, known)):
+        return known
+    ingest(source, tables, findings, unknown)
+    return known_files(tables.open(INGESTED), scope)
 
 
 def _view(name: str, found: Mapping[str, Any], columns: str, *, is_pruned: bool) -> str:
