@@ -129,6 +129,22 @@ function take(head, body) {
   give(head, body);
 }
 
+// What a moment has for the floor plan, which may be loaded later than the moment.
+let ofMoment = [];
+views.onPlan = () => {
+  if (!past.value || !views.plan) return;
+  for (const [item, body] of ofMoment) {
+    if (item.kind === 'path') views.plan.trail(poses(item, body));
+    else if (item.kind === 'cloud' && item.topic === chosen('cloud')) views.plan.cloud(item, body, true);
+  }
+  if (pastRings.odom.names.length) views.plan.pose(pastRings.odom.last());
+};
+
+const poses = ({ points }, body) => {
+  const view = new DataView(body.buffer);
+  return Array.from({ length: points }, (_, row) => [0, 1, 2].map((place) => view.getFloat32((row * 3 + place) * 4, true)));
+};
+
 // Of a moment that is past, all there is of it, at once.
 show((head, items) => {
   rewatch();
@@ -136,10 +152,7 @@ show((head, items) => {
   for (const [item, body] of items) {
     const { kind, topic } = item;
     if (kind === 'path') {
-      const view = new DataView(body.buffer);
-      const poses = Array.from({ length: item.points }, (_, row) => [0, 1, 2].map((place) => view.getFloat32((row * 3 + place) * 4, true)));
-      views.plan?.trail(poses);
-      views.cloud?.trail(poses);
+      views.cloud?.trail(poses(item, body));
     } else if (topic !== chosen(kind)) {
       // another topic of the kind is shown
     } else if (kind === 'camera') {
@@ -148,16 +161,14 @@ show((head, items) => {
     } else if (kind === 'cloud') {
       newest.set(kind, [item, body]);
       views.cloud?.take(item, body);
-      views.plan?.cloud(item, body, true);
     } else if (pastRings[kind]) {
       pastRings[kind].add(item, body);
       if (kind === 'joints') views.cloud?.joints(pastRings.joints.last());
-      if (kind === 'odom') {
-        views.cloud?.pose(pastRings.odom.last());
-        views.plan?.pose(pastRings.odom.last());
-      }
+      if (kind === 'odom') views.cloud?.pose(pastRings.odom.last());
     }
   }
+  ofMoment = items;
+  views.onPlan();
   stats.past = { at: head.at, shown: head.shown, count: (stats.past?.count ?? 0) + 1 };
 });
 let wasPast = false;

@@ -15,7 +15,7 @@ const MOST_ROWS = 100;
 const MOST_FINDINGS = 10;
 const SEARCHED = 12; // more rows than these get a search box
 
-function state(row) {
+function state(row, figures) {
   if (row.unavailable) return ['bad', row.unavailable];
   const isNew = unseen(row.topic) !== 0; // what somebody has seen, or what is a day old, is no alarm
   if (row.lost && isNew) return ['bad', `${row.lost} messages were rejected or dropped`];
@@ -23,6 +23,8 @@ function state(row) {
   if (row.stamps) return ['watch', row.stamps];
   if (row.publishers === 0) return ['none', MARKS.none[1]];
   if (!row.isLogged) return ['idle', MARKS.idle[1]];
+  if (figures.state !== 'running') return ['watch', 'not recorded now: the node does not run'];
+  if (figures.paused) return ['watch', 'not recorded now: the node is paused'];
   if (row.age_s !== null && row.age_s > 5 && !row.may_be_silent) return ['watch', `silent for ${span(row.age_s)}`];
   return ['good', MARKS.good[1]];
 }
@@ -126,7 +128,7 @@ export function TopicTable({ figures, now }) {
     <div class="scroll"><table class="topics" ref=${box}>
       <thead><tr><th title="Whether the topic is recorded without losses; each mark explains itself"><span class="visually-hidden">State</span></th><th title="A click shows the newest message">Topic</th>${COLUMNS.map(([, label, what]) => html`<th class="n" title=${what}>${label}</th>`)}</tr></thead>
       <tbody>${shown.map((row) => {
-        const [kind, why] = state(row);
+        const [kind, why] = state(row, figures);
         const isOpen = inspected.value === row.topic;
         const own = isCounted(row, figures) ? null : measured.value[row.topic];
         const sample = sampling(own, figures);

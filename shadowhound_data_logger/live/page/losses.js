@@ -49,7 +49,7 @@ export function Losses({ robot, show }) {
     losses.value = { since: now, now, topics: new Map(), gaps: [] };
   };
   const ago = now - since > DAY_MS ? `since ${moment(since).slice(0, 16)}` : `since ${clock(since, false)} (${span((now - since) / 1000)} ago)`;
-  if (!gaps.length) return html`<p class="losses good" data-losses="0">Nothing was lost ${ago}.</p>`;
+  if (!gaps.length) return html`<p class="losses good" data-losses="0" title="As far as the node has reported: up to the end of the pale green bars">No loss is known ${ago}.</p>`;
   const names = [...topics.keys()].sort((one, other) => topics.get(other) - topics.get(one));
   const causes = [...new Set(gaps.map((gap) => gap.cause))];
   const messages = gaps.reduce((sum, gap) => sum + gap.count, 0);

@@ -204,6 +204,7 @@ export function Plan() {
     let timer;
     import('./plan.js').then(({ FloorPlan }) => {
       views.plan = new FloorPlan(canvas.current, transforms);
+      views.onPlan();
       timer = setInterval(() => !document.hidden && views.plan?.draw(), calm.matches ? 1000 : 250);
     });
     return () => {

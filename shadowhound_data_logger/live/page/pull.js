@@ -31,6 +31,7 @@ export function Pull({ session, robot, selected }) {
   const [sensor, setSensor] = useState('');
   const [said, setSaid] = useState(['', '']);
   const [rounds, again] = useState(0);
+  const [mine, setMine] = useState(null); // was asked for here, and may not be listed yet
   const at = Math.round(past.value.at);
   const [from, to] = selected ? [Math.round(selected[0]), Math.round(selected[1]) + 1] : [at - AROUND_MS, at + AROUND_MS];
   const mayAct = session.role === 'operator';
@@ -61,16 +62,19 @@ export function Pull({ session, robot, selected }) {
     try {
       const answer = await fetch('/api/pull', { method: 'POST', headers: { 'Content-Type': 'application/json', 'X-CSRF-Token': session.csrf }, body: JSON.stringify({ robot, ...what }) });
       const content = await answer.json();
-      setSaid(answer.ok ? ['good', done] : ['bad', content.error]);
+      setSaid(answer.ok ? ['good', done] : ['bad', `not ${done.split(' ')[0]}: ${content.error}`]);
+      if (answer.ok && what.sensor) setMine({ ...what, id: content.id });
     } catch {
-      setSaid(['bad', 'it cannot be reached']);
+      setSaid(['bad', 'the page cannot be reached']);
     }
     again(rounds + 1);
   };
   const sensors = Object.keys(kept);
-  if (!sensors.length && !asked.requests.length) return null;
+  if (!sensors.length && !asked.requests.length && !mine) return null;
   const chosen = sensors.includes(sensor) ? sensor : sensors[0];
   const found = kept[chosen];
+  // The node numbers its answers after those in the store: it accepts no request while that is unreachable.
+  const waits = session.has_live && mine && asked.requests.every((each) => each.id !== mine.id);
   const lost = Object.entries(found?.lost ?? {});
   return html`<div class="pull"><div class="panel-head"><h3 title="Data of the selected time that the robot does not send unless it is requested">Kept on the robot</h3><span class="unit">${clock(from)} for ${span((to - from) / 1000)}</span></div>
     ${found && html`<div class="row"><select aria-label="Sensor" value=${chosen} onChange=${(event) => setSensor(event.target.value)}>${sensors.map((name) => html`<option>${name}</option>`)}</select>
@@ -79,5 +83,5 @@ export function Pull({ session, robot, selected }) {
       ${mayAct ? html`<button type="button" class="primary" data-act="pull" title="They are sent to the store" disabled=${!found.objects} onClick=${() => post({ sensor: chosen, from, to }, `requested from ${robot}`)}>Request them</button>`
         : html`<span class="unit">an operator can request them</span>`}</div>`}
     ${said[1] && html`<p class=${`note ${said[0]}`} role="status">${said[1]}</p>`}
-    <ol class="answers requests" aria-live="polite">${asked.requests.map((each) => html`<${Request} key=${each.id} each=${each} mbps=${asked.mbps} mayCancel=${mayAct} cancel=${(id) => post({ cancel: id }, 'canceled')} />`)}</ol></div>`;
+    <ol class="answers requests" aria-live="polite">${waits && html`<li data-waits-for-node><b>waits</b> ${mine.sensor} ${moment(mine.from)} for ${span((mine.to - mine.from) / 1000)}: the node has the request, and accepts it once the store can be reached. If the node is restarted before, request it again.</li>`}${asked.requests.map((each) => html`<${Request} key=${each.id} each=${each} mbps=${asked.mbps} mayCancel=${mayAct} cancel=${(id) => post({ cancel: id }, 'canceled')} />`)}</ol></div>`;
 }

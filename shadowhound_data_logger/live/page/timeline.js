@@ -180,14 +180,14 @@ function LabelForm({ session, robot, selected, clear }) {
     try {
       const answer = await fetch('/api/label', { method: 'POST', headers: { 'Content-Type': 'application/json', 'X-CSRF-Token': session.csrf }, body: JSON.stringify({ robot, label, note, from, to }) });
       const content = await answer.json();
-      setSaid(answer.ok ? ['good', `labeled ${label}`] : ['bad', content.error]);
+      setSaid(answer.ok ? ['good', `labeled ${label}`] : ['bad', `not labeled: ${content.error}`]);
       if (!answer.ok) return;
       setLabel('');
       setNote('');
       clear();
       look(robot, range.value.from, range.value.to);
     } catch {
-      setSaid(['bad', 'it cannot be reached']);
+      setSaid(['bad', 'not labeled: the page cannot be reached']);
     }
   };
   return html`<form class="row label-form" onSubmit=${submit}><input aria-label="Label" name="label" placeholder="label, such as stairs" required maxlength="200" value=${label} onInput=${(event) => setLabel(event.target.value)} />

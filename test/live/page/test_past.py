@@ -31,6 +31,10 @@ pytestmark = [
 ]
 
 
+DRAWN = 'canvas => canvas.width > 0 && canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some(Boolean)'
+"""Whether anything is drawn."""
+
+
 def minute(store: ObjectStore, folder: Path) -> None:
     """A minute of camera at 5 Hz and odometry, and the part with their rows."""
     rows = []
@@ -148,6 +152,7 @@ def test_the_page_of_a_store_shows_the_past_without_a_robot(
     with Served(store_page, monkeypatch) as served:
         page = opened(browser, served.server.url)
         holds(page, "document.querySelectorAll('rect.recorded').length > 2 && shadowhound.past?.shown.length > 2")
+        holds(page, f'({DRAWN})(document.querySelector("section[aria-label=Path] canvas"))')
         press(page.get_by_role('button', name='Sign in', exact=True))
         page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
         press(page.locator('dialog button.primary'))
