@@ -65,7 +65,7 @@ setup(
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
         'tower': ['grpcio>=1.66.2'],
         'train': ['mlflow-skinny>=2.14', 'torch>=2.6'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more
-        'webrtc': ['aiortc>=1.15,<1.17', 'av>=15'],
+        'webrtc': ['aiortc>=1.15,<2', 'av>=15'],
         'test': ['pytest'],  # colcon runs pytest where a test extra names it
     },
     entry_points={

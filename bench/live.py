@@ -6,8 +6,9 @@
 
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a
 network namespace whose uplink from the page has this many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the
-camera as WebRTC and decodes it. With ``--round-trip`` each packet is delayed by half of this many ms, as through a VPN, next to
-a viewer without delay; it needs root as well. ``--beside`` adds a second viewer that reads this many Mbit/s, and measures its
+camera as WebRTC and decodes it; ``--drop`` narrows the link in the middle. With
+``--round-trip`` each packet is delayed by half of this many ms, as through a VPN, next to a viewer without delay; it needs root
+as well. ``--beside`` adds a second viewer that reads this many Mbit/s, and measures its
 effect on the first. ``--browser`` opens the page in a Chromium on a simulated separate machine (a network namespace): delays of
 items until they arrive and are drawn, the first frame, outages of 10 s. ``--pairs`` alternates the node's CPU with and without
 viewers, ``--minutes`` measures the page's memory while viewers come and go. ``--floor`` measures the page with one viewer next
@@ -31,6 +32,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -44,12 +46,14 @@ from _report import Bar, show, spread
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from domains import free_domain
-from e2e.live_frames import Frames
+from e2e.live_frames import Frames, first_shown_ms
 from e2e.machines import ROBOT, Machines
 from e2e.processes import Node, Process, Processes, until
 
 TOPICS = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
 KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
+OWN = '192.0.2.1'
+"""Of the page, with ``--link``."""
 WATCHING = 8
 """While the page is killed."""
 TAKINGS = 1.8
@@ -68,6 +72,7 @@ class Watcher:
         self.late_ms: dict[str, list[float]] = {}
         self.bytes = self.acknowledgements = 0
         self.takes_video = False
+        self.video: Video | None = None
         self.token = ''
 
     async def run(self, *, reads: bool = True, bytes_s: float = 0.0) -> None:
@@ -77,10 +82,7 @@ class Watcher:
             aiohttp.ClientSession(headers={'Origin': self.url.rstrip('/')}, cookie_jar=jar) as session,
             await self.connected(session) as ws,
         ):
-            await ws.send_json({'watch': self.topics})
-            if self.takes_video:
-                video = Video(self.late_ms)
-                await ws.send_json({'watch': self.topics[1:], 'video': {'topic': self.topics[0], 'offer': await video.offer()}})
+            await self.watch(ws)
             frames = Frames()
             if not reads:
                 await asyncio.sleep(3600)
@@ -100,15 +102,28 @@ class Watcher:
                 if acknowledging is None or acknowledging.done():
                     acknowledging = asyncio.create_task(acknowledge())
                 for head, body in items:
-                    if head['kind'] == 'video' and self.takes_video:
-                        await video.told(head)
-                    if 'at' in head and head['kind'] in KINDS:  # one machine, one monotonic clock
-                        now_ms = time.monotonic() * 1e3
-                        times = struct.unpack_from(f'<{head["rows"]}d', body) if 'rows' in head else (head['at'],)
-                        self.late_ms.setdefault(head['kind'], []).extend(now_ms - at_ms for at_ms in times)
+                    if head['kind'] == 'video':
+                        await self.video.on_item(head)
+                    if 'at' in head and head['kind'] in KINDS:
+                        self.note(head, body)
                 if time.monotonic() - pinged_s > 1:
                     pinged_s = time.monotonic()
                     await ws.send_json({'ping': pinged_s})
+                if self.video is not None:
+                    await self.video.report(ws)
+
+    async def watch(self, ws: aiohttp.ClientWebSocketResponse) -> None:
+        await ws.send_json({'watch': self.topics})
+        if self.takes_video:
+            self.video = Video(self.late_ms)
+            offer = await self.video.offer()
+            await ws.send_json({'watch': self.topics[1:], 'video': {'topic': self.topics[0], 'offer': offer}})
+
+    def note(self, head: dict[str, Any], body: bytes) -> None:
+        """Its delay: one machine has one monotonic clock."""
+        now_ms = time.monotonic() * 1e3
+        times = struct.unpack_from(f'<{head["rows"]}d', body) if 'rows' in head else (head['at'],)
+        self.late_ms.setdefault(head['kind'], []).extend(now_ms - at_ms for at_ms in times)
 
     async def connected(self, session: aiohttp.ClientSession) -> aiohttp.ClientWebSocketResponse:
         if self.token:
@@ -124,6 +139,8 @@ class Watcher:
             late = sorted(unordered)
             found[kind] = {'hz': round(len(late) / seconds, 1), 'median_ms': round(statistics.median(late), 1),
                            'p95_ms': round(late[int(len(late) * 0.95)], 1)}  # fmt: skip
+        if self.video is not None:
+            found['frozen_s'] = round(self.video.frozen_s, 2)
         return found
 
 
@@ -134,6 +151,13 @@ class Video:
         self.late_ms = late_ms
         self.pc = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
         self.first_ms: float | None = None
+        self.sent_ms: list[float] = []
+        self.shown: list[int] = []
+        self.delays: list[float] = []
+        self.frozen_s = 0.0
+        """Longest interval between frames."""
+        self._shown_s = self._reported_s = time.monotonic()
+        self._before = (0, 0, 0)
 
     async def offer(self) -> str:
         self.pc.addTransceiver('video', direction='recvonly')
@@ -141,19 +165,44 @@ class Video:
         await self.pc.setLocalDescription(await self.pc.createOffer())
         return self.pc.localDescription.sdp
 
-    async def told(self, head: dict[str, Any]) -> None:
+    async def on_item(self, head: dict[str, Any]) -> None:
         if 'answer' in head:
             await self.pc.setRemoteDescription(aiortc.RTCSessionDescription(head['answer'], 'answer'))
-        elif 'rtp' in head:
-            self.first_ms = head['at']
         elif 'problem' in head:
             raise SystemExit(head['problem'])
+        elif 'at' in head:
+            self.sent_ms.append(head['at'])
+
+    async def report(self, ws: aiohttp.ClientWebSocketResponse) -> None:
+        """Twice per second, as in video.js; aiortc has no count of its requests for key frames."""
+        now_s = time.monotonic()
+        if self.pc.connectionState != 'connected' or now_s - self._reported_s < 0.5:
+            return
+        stats = (await self.pc.getReceivers()[0].getStats()).values()
+        stream = next((each for each in stats if each.type == 'inbound-rtp'), None)
+        size = sum(each.bytesReceived for each in stats if each.type == 'transport')
+        now = (size, stream.packetsReceived, stream.packetsLost) if stream is not None else self._before
+        size, packets, lost = (after - before for after, before in zip(now, self._before, strict=True))
+        seconds, self._before, self._reported_s = now_s - self._reported_s, now, now_s
+        delay = statistics.median(self.delays) if self.delays else None
+        self.delays.clear()
+        report = {'bitrate': size * 8 / seconds, 'lost': max(0, lost) / max(1, packets + lost), 'delay': delay,
+                  'key': packets > 0 and now_s - self._shown_s > 1}  # fmt: skip
+        await ws.send_json({'video': {'report': report}})
 
     async def read(self, track: aiortc.MediaStreamTrack) -> None:
         while True:
             frame = await track.recv()  # its pts begin with 0
+            now_s = time.monotonic()
+            if self.shown:
+                self.frozen_s = max(self.frozen_s, now_s - self._shown_s)
+            self._shown_s = now_s
+            if self.first_ms is None:
+                self.shown.append(frame.pts)
+                self.first_ms = first_shown_ms(self.sent_ms, self.shown)
             if self.first_ms is not None:
-                self.late_ms.setdefault('camera', []).append(time.monotonic() * 1e3 - self.first_ms - frame.pts / 90)
+                self.delays.append(now_s * 1e3 - self.first_ms - frame.pts / 90)
+                self.late_ms.setdefault('camera', []).append(self.delays[-1])
 
 
 def cpu_s(pid: int) -> float:
@@ -181,6 +230,8 @@ def watched(url: str, count: int, seconds: float, pids: dict[str, int], *,
         for watcher in watchers:
             watcher.late_ms.clear()
             watcher.acknowledgements = 0
+            if watcher.video is not None:
+                watcher.video.frozen_s = 0.0
         sizes = [watcher.bytes for watcher in watchers]
         before, began = {name: cpu_s(pid) for name, pid in pids.items()}, time.monotonic()
         await asyncio.sleep(seconds)
@@ -324,12 +375,20 @@ def shape(url: str, mbps: float) -> None:
         'ip link set lo mtu 1500',
         'tc qdisc add dev lo root handle 1: htb default 1',
         'tc class add dev lo parent 1: classid 1:1 htb rate 10gbit quantum 60000',
-        f'tc class add dev lo parent 1: classid 1:2 htb rate {mbps}mbit burst 8kb',
-        'tc qdisc add dev lo parent 1:2 bfifo limit 200kb',
-        f'tc filter add dev lo parent 1: protocol ip prio 1 u32 match ip sport {port} 0xffff flowid 1:2',
-        'tc filter add dev lo parent 1: protocol ip prio 2 u32 match ip tos 0x88 0xfc flowid 1:2',  # video
     ):
         subprocess.run(command.split(), check=True)
+    limit('add', mbps)
+    for command in (
+        'tc qdisc add dev lo parent 1:2 bfifo limit 200kb',
+        f'tc filter add dev lo parent 1: protocol ip prio 1 u32 match ip sport {port} 0xffff flowid 1:2',
+        f'tc filter add dev lo parent 1: protocol ip prio 2 u32 match ip protocol 17 0xff match ip src {OWN} flowid 1:2',  # video
+    ):
+        subprocess.run(command.split(), check=True)
+
+
+def limit(do: str, mbps: float) -> None:
+    command = f'tc class {do} dev lo parent 1: classid 1:2 htb rate {mbps}mbit burst 8kb'
+    subprocess.run(command.split(), check=True)
 
 
 def at_most(what: str, limit: float, value: float, unit: str, rounds: Sequence[float] = ()) -> Bar:
@@ -434,9 +493,10 @@ def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[
     node = processes.node()
     sim = processes.sim(f'rate_scale:={given.scale}')
     way = LongWay(0.0) if given.round_trip else None
-    bound = ['--bind', ROBOT] if machines else ['--bind', NEAR, '--name', FAR] if way else []
+    bound = ['--bind', ROBOT] if machines else ['--bind', NEAR, '--name', FAR] if way else ['--bind', OWN] if given.link else []
     live, url = processes.page(node, *bound)
     pids = {'node': node.popen.pid, 'live': live.popen.pid}
+    token = (node.home / 'live' / 'viewer.token').read_text().strip()
     until(lambda: node.topic('/imu').get('received', 0) > 50, 'the robot is heard')
 
     def tell(row: dict[str, Any]) -> dict[str, Any]:
@@ -444,7 +504,6 @@ def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[
         return row
 
     if machines:
-        token = (node.home / 'live' / 'viewer.token').read_text().strip()
         bars = browser_bars(tell(in_browser(url, token, machines, folder, given.seconds)))
     elif given.pairs:
         row = tell(paired(url, given.viewers, given.seconds, given.pairs, pids))
@@ -459,9 +518,13 @@ def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[
         bars = beside_bars(tell(beside(url, given.seconds, given.beside)))
     elif given.link:
         shape(url, given.link)
-        bars = link_bars(tell(watched(url, 1, given.seconds, pids, video=given.video)), given.link, video=given.video)
+        if given.drop:
+            timer = threading.Timer((15 if given.video else 4) + given.seconds / 2, limit, ('change', given.drop))
+            stack.callback(timer.cancel)
+            timer.start()
+        row = tell(watched(url, 1, given.seconds, pids, video=given.video, token=token))
+        bars = link_bars(row, given.drop or given.link, video=given.video)
     elif way:
-        token = (node.home / 'live' / 'viewer.token').read_text().strip()
         far_url = url.replace(NEAR, FAR)
         near = tell(watched(far_url, 1, given.seconds, pids, token=token))
         way.round_s = given.round_trip / 1e3
@@ -480,6 +543,7 @@ def main() -> int:
     parser.add_argument('--viewers', type=int, default=3, help='of the rows with more than one (default 3)')
     parser.add_argument('--link', type=float, default=0.0, metavar='MBPS', help='what the page sends leaves no faster')
     parser.add_argument('--video', action='store_true', help='with --link: take the camera as WebRTC')
+    parser.add_argument('--drop', type=float, default=0.0, metavar='MBPS', help='with --link: the rate of the second half')
     parser.add_argument('--round-trip', type=float, default=0.0, metavar='MS', help='a packet and its answer take so long')
     parser.add_argument('--kills', type=int, default=0, help='so often the page is killed while eight watch')
     parser.add_argument('--beside', type=float, default=0.0, metavar='MBPS', help='a second viewer that reads no faster')
@@ -495,7 +559,7 @@ def main() -> int:
     if given.link or given.round_trip:
         subprocess.run(['ip', 'link', 'set', 'lo', 'up'], check=True)
     if given.link:
-        subprocess.run(['ip', 'addr', 'add', '192.0.2.1/32', 'dev', 'lo'], check=True)  # aiortc's viewer takes no 127.0.0.1
+        subprocess.run(['ip', 'addr', 'add', f'{OWN}/32', 'dev', 'lo'], check=True)  # there is no video on 127.0.0.1
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bars = measured(given, stack, Path(folder))
     for bar in bars:

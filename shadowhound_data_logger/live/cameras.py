@@ -81,8 +81,3 @@ class Cameras:
     def has(self, who: object) -> bool:
         """Whether a viewer takes video and is connected."""
         return self.video is not None and self.video.has(who)
-
-    def tick(self) -> None:
-        """Once per second."""
-        if self.video is not None:
-            self.video.tick()

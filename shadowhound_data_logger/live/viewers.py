@@ -189,7 +189,6 @@ class Viewers:
 
     def tick(self, now_s: float) -> None:
         """Once per second: update the sizes for each viewer."""
-        self._cameras.tick()
         for one in self.connected:
             one.viewer.has_video = self._cameras.has(one)
             one.viewer.round_s = _round_s(one.transport)

@@ -1,20 +1,24 @@
 """The camera as video over WebRTC, encoded once for all viewers. Importing this loads aiortc (the extra ``webrtc``).
 
 The newest JPEG of a topic is decoded and encoded as VP8 on a separate thread; its packets are sent to each peer. RTP timestamps
-are the times of arrival, at 90 kHz, so the page knows the age of each frame. Packets are sent only to the viewer's own address:
-candidates of an offer contribute ports and no addresses, and no STUN server is used. aiortc has no interface for three things
-that are needed: the receiver's bandwidth estimate, its requests for key frames, and the start of timestamps. They are read from
-private attributes of the versions pinned in setup.py.
+are the times of arrival, at 90 kHz, from a random start: the viewer is also sent the times of its first frames, finds the start
+by comparing both, and then knows the age of each frame. Twice per second it reports what it received: the bitrate follows from
+the delay and the loss, and a viewer that cannot decode gets a key frame.
+
+Packets are sent only to the viewer's own address: candidates of an offer contribute ports and no addresses, and no STUN server
+is used. aiortc listens on all addresses except loopback, so a viewer on loopback is refused: a page that listens only there must
+not open ports on the network.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import random
 import re
-import socket
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections import deque
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -28,7 +32,6 @@ import numpy as np
 import simplejpeg
 from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCRtpSender, RTCSessionDescription
 from aiortc.exceptions import InvalidAccessError, InvalidStateError, OperationError
-from aiortc.rtp import RTCP_PSFB_APP, RTCP_PSFB_FIR, RTCP_PSFB_PLI, RtcpPsfbPacket, unpack_remb_fci
 
 from shadowhound_data_logger.core.untrusted import check_pixels
 from shadowhound_data_logger.core.worker import Worker
@@ -45,10 +48,15 @@ CLOCK_HZ: Final = 90_000
 """Of RTP timestamps of video (RFC 7741)."""
 MIN_RATE, FIRST_RATE, MAX_RATE = 150_000, 500_000, 1_500_000
 """Bitrate of a topic."""
-RATE_SHARE: Final = 0.85
-"""Share of the receiver's estimated bandwidth."""
-RAISE_EVERY_S: Final = 4.0
-"""A new rate starts with a key frame, so increases are delayed."""
+LOWER, RAISE = 0.7, 1.25
+"""Factors of the bitrate."""
+RAISE_EVERY_S, RAISE_AFTER_S, LOWER_EVERY_S = 4.0, 20.0, 2.0
+"""Intervals of changes, and from a decrease to the next increase: a new rate starts with a key frame."""
+MAX_QUEUED_MS: Final = 100.0
+"""A viewer whose frames take this much longer than its fastest recent ones has a full link."""
+RECENT_REPORTS: Final = 60
+MAX_LOST: Final = 0.1
+"""Share of packets."""
 MAX_WAITING: Final = 10
 """Maximum packets queued for a peer; then it continues with the next key frame."""
 CONNECT_S: Final = 10.0
@@ -56,6 +64,10 @@ VP8: Final = 'video/VP8'
 KEY_EVERY_S: Final = 0.7
 """Minimum interval between key frames that receivers request."""
 _TICKS_PER_MS: Final = CLOCK_HZ // 1000
+_DITHER: Final = 30
+"""Ticks (0.33 ms) of noise in timestamps, so that the times of a few frames match in one way, also with an exact period."""
+MAX_NUMBER: Final = 1e12
+"""In a report."""
 _CANDIDATE: Final = re.compile(r'a=candidate:\S+ 1 udp \d+ \S+ (\d{1,5}) typ host', re.IGNORECASE)
 _MAX_CANDIDATES: Final = 8
 _BROKEN: Final = (InvalidAccessError, InvalidStateError, OperationError, ValueError, LookupError, TypeError, AttributeError,
@@ -63,15 +75,42 @@ _BROKEN: Final = (InvalidAccessError, InvalidStateError, OperationError, ValueEr
 """Errors of aiortc for an invalid offer."""
 
 
+ON_LOOPBACK: Final = 'this page was opened on the robot or through a tunnel; for video, open it at an address of its network'
+
+
 class OfferRefused(Exception):
     """A viewer cannot take video; the text has the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Report:
+    """What a viewer received since its previous report."""
+
+    bitrate: float
+    lost: float
+    """Share of packets."""
+    delay_ms: float | None
+    """From the arrival of frames at the robot until they were shown, plus a constant; None while unknown."""
+    needs_key: bool
+
+    @classmethod
+    def parsed(cls, fields: Any) -> _Report | None:
+        """None if it is invalid."""
+        match fields:
+            case {
+                'bitrate': int() | float() as bitrate,
+                'lost': int() | float() as lost,
+                'delay': int() | float() | None as delay_ms,
+            }:
+                is_valid = all(abs(number) < MAX_NUMBER for number in (bitrate, lost, delay_ms or 0.0))
+                return cls(bitrate, lost, delay_ms, bool(fields.get('key'))) if is_valid else None
+        return None
 
 
 @dataclass(frozen=True, slots=True)
 class _Encoded:
     packet: Any
     """av.Packet."""
-    at_ms: float
     is_key: bool
     """Whether it is independent of other frames."""
 
@@ -85,7 +124,8 @@ class _Vp8Encoder:
         self._waiting: tuple[float, bytes] | None = None
         self._wants_key = True
         self._key_s = -KEY_EVERY_S
-        self._rate = FIRST_RATE
+        self.rate = FIRST_RATE
+        """Bits per second."""
         self._codec: Any = None
         self._last_pts = -1
         self.encoded = self.keys = 0
@@ -106,7 +146,7 @@ class _Vp8Encoder:
 
     def set_rate(self, rate: int) -> None:
         with self._changed:
-            self._rate = rate
+            self.rate = rate
 
     async def close(self) -> None:
         self.worker.stop()
@@ -122,7 +162,7 @@ class _Vp8Encoder:
             if self._waiting is None:
                 return
             (at_ms, jpeg), self._waiting = self._waiting, None
-            rate = self._rate
+            rate = self.rate
             is_key = self._wants_key and time.monotonic() - self._key_s >= KEY_EVERY_S
             if is_key:
                 self._wants_key, self._key_s = False, time.monotonic()
@@ -130,7 +170,7 @@ class _Vp8Encoder:
             frame = _frame(jpeg)
         except ValueError:
             return  # the page shows the age of the last valid one
-        pts = round(at_ms * _TICKS_PER_MS)
+        pts = round(at_ms * _TICKS_PER_MS) + random.randint(-_DITHER, _DITHER)
         if pts <= self._last_pts:
             return
         self._last_pts = frame.pts = pts
@@ -142,7 +182,7 @@ class _Vp8Encoder:
             packet.pts, packet.time_base = pts, frame.time_base
             self.encoded += 1
             self.keys += bool(packet.is_keyframe)
-            self._on_encoded_frame(_Encoded(packet, at_ms, bool(packet.is_keyframe)))
+            self._on_encoded_frame(_Encoded(packet, bool(packet.is_keyframe)))
 
     def _codec_for(self, frame: Any, rate: int) -> Any:
         codec = self._codec
@@ -180,11 +220,10 @@ class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
 
     kind = 'video'
 
-    def __init__(self, ask_key: Callable[[], None], sent: Callable[[_Encoded], None]) -> None:
+    def __init__(self, ask_key: Callable[[], None], on_packet: Callable[[Any], None]) -> None:
         super().__init__()
-        self._ask_key, self._sent = ask_key, sent
+        self._ask_key, self._on_packet = ask_key, on_packet
         self._waiting: asyncio.Queue[_Encoded] = asyncio.Queue()
-        self._last: _Encoded | None = None
         self._needs_key = True
         self._key_requested = False
 
@@ -193,10 +232,9 @@ class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
         if not self._key_requested:
             self._key_requested = True
             self._ask_key()
-        if self._last is not None:
-            self._sent(self._last)
-        self._last = await self._waiting.get()
-        return self._last.packet
+        packet = (await self._waiting.get()).packet
+        self._on_packet(packet)
+        return packet
 
     def offer(self, encoded: _Encoded) -> None:
         if not self._key_requested:
@@ -218,27 +256,22 @@ class _Peer:
     def __init__(self, topic: str, video: CameraVideo, tell: Callable[[Mapping[str, Any]], None]) -> None:
         self.topic, self._video, self._tell = topic, video, tell
         self.pc = RTCPeerConnection(RTCConfiguration(iceServers=[]))
-        self.track = _PacketTrack(lambda: video.ask_key(self), self._on_sent)
-        self.rate: float | None = None
-        """Estimated bandwidth of its link, bits per second."""
+        self.track = _PacketTrack(lambda: video.ask_key(self), self._on_packet)
+        self.rate: float = FIRST_RATE
+        """What its link carries, bits per second."""
         self.is_answered = False
-        self._has_reported = False
-        self.sender: RTCRtpSender = self.pc.addTrack(self.track)
+        self._knows_ages = False
+        self._delays_ms: deque[float] = deque(maxlen=RECENT_REPORTS)
+        self._lower_s, self._raise_s = 0.0, time.monotonic() + RAISE_EVERY_S
+        """When the rate may be decreased or increased again."""
+        self.pc.addTrack(self.track)
 
-    async def answer(self, offer: str, own: str, remote: str) -> str:
+    async def answer(self, offer: str, remote: str) -> str:
         """Raises OfferRefused."""
         (transceiver,) = self.pc.getTransceivers()
         known = RTCRtpSender.getCapabilities('video').codecs
         transceiver.setCodecPreferences([codec for name in (VP8, 'video/rtx') for codec in known if codec.mimeType == name])
         await self.pc.setRemoteDescription(RTCSessionDescription(_with_address(offer, remote), 'offer'))
-        _gather_at(self.sender.transport.transport.iceGatherer._connection, own)
-        handle = self.sender._handle_rtcp_packet
-
-        async def read(packet: Any) -> None:
-            self._on_rtcp(packet)
-            await handle(packet)
-
-        self.sender._handle_rtcp_packet = read
         self.pc.on('connectionstatechange', self._on_state)
         await self.pc.setLocalDescription(await self.pc.createAnswer())
         self.is_answered = True
@@ -248,19 +281,27 @@ class _Peer:
         if self.pc.connectionState in ('failed', 'closed'):
             self._video.lost(self, 'the connection for video (UDP) was lost')
 
-    def _on_sent(self, encoded: _Encoded) -> None:
-        if not self._has_reported:
-            self._has_reported = True
-            self._tell({'rtp': self.sender._RTCRtpSender__rtp_timestamp, 'at': encoded.at_ms, 'topic': self.topic})
+    def _on_packet(self, packet: Any) -> None:
+        if not self._knows_ages:
+            self._tell({'at': packet.pts / _TICKS_PER_MS, 'topic': self.topic})
 
-    def _on_rtcp(self, packet: Any) -> None:
-        if not isinstance(packet, RtcpPsfbPacket):
-            return
-        if packet.fmt in (RTCP_PSFB_PLI, RTCP_PSFB_FIR):
+    def on_report(self, report: _Report, rate: float) -> None:
+        """``rate``: what the topic is encoded with."""
+        if report.needs_key:
             self._video.ask_key(self)
-        elif packet.fmt == RTCP_PSFB_APP:
-            with suppress(ValueError):
-                self.rate = float(unpack_remb_fci(packet.fci)[0])
+        queued_ms = 0.0
+        if report.delay_ms is not None:
+            self._knows_ages = True
+            self._delays_ms.append(report.delay_ms)
+            queued_ms = report.delay_ms - min(self._delays_ms)
+        now_s = time.monotonic()
+        if queued_ms > MAX_QUEUED_MS or report.lost > MAX_LOST:
+            if now_s >= self._lower_s:
+                self.rate = max(LOWER * min(rate, max(report.bitrate, rate / 2)), MIN_RATE)
+                self._lower_s, self._raise_s = now_s + LOWER_EVERY_S, now_s + RAISE_AFTER_S
+        elif now_s >= self._raise_s:
+            self.rate = min(RAISE * rate, MAX_RATE)
+            self._raise_s = now_s + RAISE_EVERY_S
 
 
 class CameraVideo:
@@ -274,7 +315,6 @@ class CameraVideo:
         self._loop = asyncio.get_running_loop()
         self._encoders: dict[str, _Vp8Encoder] = {}
         """By topic."""
-        self._rates: dict[str, tuple[int, float]] = {}
         self._peers: dict[object, _Peer] = {}
         self._ending: set[asyncio.Task[None]] = set()
         for name in ('aioice', 'aiortc'):
@@ -297,10 +337,13 @@ class CameraVideo:
     async def take(self, who: object, request: Mapping[str, Any], addresses: tuple[str, str],
                    tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
         """A viewer requests a topic: ``request`` has ``topic`` and ``offer`` (SDP). ``tell`` is called with the answer, or the
-        problem.
+        problem. Or it has a ``report`` on the topic that it takes.
 
         ``addresses``: our address that it connected to, and its own.
         """
+        if 'report' in request:
+            self._on_report(who, _Report.parsed(request['report']))
+            return
         self.end(who)
         try:
             peer = self._new_peer(who, request.get('topic'), tell)
@@ -310,6 +353,14 @@ class CameraVideo:
         else:
             tell({'answer': answer})
             self._loop.call_later(CONNECT_S, self._check_connection, peer)
+
+    def _on_report(self, who: object, report: _Report | None) -> None:
+        """The rate of a topic is what the slowest of its links carries."""
+        peer = self._peers.get(who)
+        encoder = self._encoders.get(peer.topic) if peer is not None else None
+        if report is not None and peer is not None and encoder is not None:
+            peer.on_report(report, encoder.rate)
+            encoder.set_rate(int(min(each.rate for each in self._peers.values() if each.topic == peer.topic)))
 
     def _new_peer(self, who: object, topic: Any, tell: Callable[[Mapping[str, Any]], None]) -> _Peer:
         if not isinstance(topic, str):
@@ -325,7 +376,10 @@ class CameraVideo:
         """On any failure the peer is closed. Raises OfferRefused."""
         answer = None
         try:
-            answer = await peer.answer(offer, *map(_plain, addresses))
+            own, remote = map(_plain, addresses)
+            if ip_address(own.partition('%')[0]).is_loopback:
+                raise OfferRefused(ON_LOOPBACK)
+            answer = await peer.answer(offer, remote)
         except _BROKEN as error:
             raise OfferRefused(f'the offer cannot be answered: {type(error).__name__}') from error
         finally:
@@ -355,19 +409,6 @@ class CameraVideo:
         """Whether the viewer takes video, and is connected."""
         return (peer := self._peers.get(who)) is not None and peer.pc.connectionState == 'connected'
 
-    def tick(self) -> None:
-        """Once per second: the rate of each topic is what the slowest of its links carries."""
-        now_s = time.monotonic()
-        for topic, encoder in self._encoders.items():
-            told = [peer.rate for peer in self._peers.values() if peer.topic == topic and peer.rate is not None]
-            if not told:
-                continue
-            rate, since_s = self._rates.get(topic, (FIRST_RATE, -RAISE_EVERY_S))
-            wanted = int(min(max(min(told) * RATE_SHARE, MIN_RATE), MAX_RATE))
-            if wanted < 0.9 * rate or (wanted > 1.25 * rate and now_s - since_s >= RAISE_EVERY_S):
-                self._rates[topic] = wanted, now_s
-                encoder.set_rate(wanted)
-
     async def close(self) -> None:
         for who in list(self._peers):
             self.end(who)
@@ -382,7 +423,6 @@ class CameraVideo:
         """Keep encoders exactly for the topics in use."""
         wanted = {peer.topic for peer in self._peers.values() if peer.is_answered}
         for topic in self._encoders.keys() - wanted:
-            self._rates.pop(topic, None)
             self._end(self._encoders.pop(topic).close())
         for topic in wanted - self._encoders.keys():
             encoder = self._encoders[topic] = _Vp8Encoder(partial(self._on_encoded, topic))
@@ -416,20 +456,3 @@ def _with_address(offer: str, remote: str) -> str:
     ports = ports[:_MAX_CANDIDATES] or [9]  # without any, the answering side would not wait for the other
     lines += [f'a=candidate:{index} 1 udp 2122260223 {remote} {port} typ host' for index, port in enumerate(ports)]
     return '\r\n'.join([*lines, 'a=end-of-candidates', ''])
-
-
-def _gather_at(connection: Any, address: str) -> None:
-    """Make an ICE connection (aioice) listen only at this address; by default it skips loopback."""
-    gather: Callable[..., Awaitable[list[Any]]] = connection.get_component_candidates
-
-    async def at_address(component: int, addresses: list[str], timeout: int = 5) -> list[Any]:  # noqa: ARG001 - as aioice has it
-        found = await gather(component, [address], timeout)
-        for protocol in connection._protocols:
-            with suppress(OSError):
-                own = protocol.transport.get_extra_info('socket')
-                is_ipv6 = own.family == socket.AF_INET6
-                option = (socket.IPPROTO_IPV6, socket.IPV6_TCLASS) if is_ipv6 else (socket.IPPROTO_IP, socket.IP_TOS)
-                own.setsockopt(*option, 34 << 2)
-        return found
-
-    connection.get_component_candidates = at_address

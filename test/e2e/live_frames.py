@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
 
 from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, BEGIN, END, PART
+
+PAIRED: Final = 4
+
+
+def first_shown_ms(sent_ms: Iterable[float], shown: Sequence[int]) -> float | None:
+    """The time of the first frame shown (ms), from the times of the first frames sent and RTP timestamps, as in video.js."""
+    sent = {round(at_ms * 90): at_ms for at_ms in sent_ms}
+    for tick, at_ms in sent.items():
+        if sum(each - shown[0] + tick in sent for each in shown) >= PAIRED:
+            return at_ms
+    return None
 
 
 class Frames:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -75,32 +74,3 @@ def test_packets_to_a_viewer_are_marked_as_video(
         return found
 
     assert asyncio.run(run()) == {AF41}
-
-
-@pytest.mark.parametrize(('address', 'family', 'asked'), [
-    ('127.0.0.1', socket.AF_INET, (socket.IPPROTO_IP, socket.IP_RECVTOS)),
-    ('::1', socket.AF_INET6, (socket.IPPROTO_IPV6, socket.IPV6_RECVTCLASS)),
-])  # fmt: skip
-def test_webrtc_packets_are_marked_as_video(address: str, family: int, asked: tuple[int, int]) -> None:
-    """With IPv4 and IPv6."""
-    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
-    aioice = pytest.importorskip('aioice')
-    if family == socket.AF_INET6:
-        needs_ipv6()
-
-    async def run() -> int:
-        connection = aioice.Connection(ice_controlling=False)
-        webrtc._gather_at(connection, address)
-        await connection.gather_candidates()
-        try:
-            with socket.socket(family, socket.SOCK_DGRAM) as receiver:
-                receiver.setsockopt(*asked, 1)
-                receiver.bind((address, 0))
-                receiver.settimeout(60)
-                connection._protocols[0].transport.sendto(b'a packet', receiver.getsockname()[:2])
-                _, ((_, _, mark),), _, _ = receiver.recvmsg(100, 100)
-        finally:
-            await connection.close()
-        return int.from_bytes(mark, sys.byteorder)
-
-    assert asyncio.run(run()) == AF41

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import simplejpeg
+from e2e.live_frames import first_shown_ms
 from live.test_auth import Page, serving
 
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
@@ -49,6 +51,14 @@ def picture(number: int) -> bytes:
     )
 
 
+async def open_page(tab: Any, found: Robot) -> None:
+    """As on another machine of the network."""
+    tab.set_default_timeout(90_000)
+    await tab.goto(f'http://{own_address()}:{found.server.port}')
+    await tab.locator('input[name=token]').fill(found.page.token('viewer'))
+    await tab.locator('button.primary').click()
+
+
 async def until(condition: Callable[[], Awaitable[Any]], what: str) -> Any:
     async def looking() -> Any:
         while not (found := await condition()):
@@ -59,6 +69,16 @@ async def until(condition: Callable[[], Awaitable[Any]], what: str) -> Any:
         return await asyncio.wait_for(looking(), 90.0)
     except asyncio.TimeoutError:
         raise AssertionError(f'within 90 s: {what}') from None
+
+
+def own_address() -> str:
+    """Of this machine on its network; nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(('192.0.2.9', 9))
+        except OSError:
+            pytest.skip('this machine has no address except loopback')
+        return str(probe.getsockname()[0])
 
 
 class Robot:
@@ -77,8 +97,8 @@ class Robot:
 
 
 @asynccontextmanager
-async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> AsyncIterator[Robot]:
-    async with serving(folder, monkeypatch, '127.0.0.1', **settings) as page:
+async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '127.0.0.1', **settings: Any) -> AsyncIterator[Robot]:
+    async with serving(folder, monkeypatch, bind, **settings) as page:
         page.server.cameras.no_video = ''
         page.server.viewers.on_graph({CAMERA: (COMPRESSED_IMAGE, 1)})
         found = Robot(page)
@@ -104,12 +124,11 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
                       shadowhound.at().camera, shadowhound.video.frames]"""
 
     async def run() -> None:
-        async with robot(tmp_path, monkeypatch) as found, api.async_playwright() as playwright:
+        async with robot(tmp_path, monkeypatch, '0.0.0.0') as found, api.async_playwright() as playwright:
             browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
             tabs = [await browser.new_page() for _ in range(2)]
             for tab in tabs:
-                tab.set_default_timeout(90_000)
-                await tab.goto(found.page.origin)
+                await open_page(tab, found)
                 await tab.select_option('[data-video]', 'video')
             for tab in tabs:
                 await until(lambda tab=tab: tab.evaluate('shadowhound.video.frames > 10'), 'frames of video')
@@ -137,6 +156,39 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
                 return not video.topics
 
             await until(is_idle, 'nothing is encoded')
+
+    asyncio.run(run())
+
+
+@pytest.mark.long('a Chromium')
+@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+def test_a_browser_that_lost_packets_continues_with_a_key_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It asks aiortc for one by RTCP (PLI), and reports that."""
+    api = pytest.importorskip('playwright.async_api')
+    pytest.importorskip('aiortc')
+
+    async def run() -> None:
+        async with robot(tmp_path, monkeypatch, '0.0.0.0') as found, api.async_playwright() as playwright:
+            browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
+            tab = await browser.new_page()
+            await open_page(tab, found)
+            await tab.select_option('[data-video]', 'video')
+            await until(lambda: tab.evaluate('shadowhound.video.frames > 10'), 'frames of video')
+            video = found.server.cameras.video
+            assert video is not None
+            (peer,), (encoder,) = video._peers.values(), video._encoders.values()
+            transport, keys = peer.pc.getSenders()[0].transport, encoder.keys
+
+            async def lose(_: bytes) -> None:
+                """Also what is sent again."""
+
+            with monkeypatch.context() as broken:
+                broken.setattr(transport, '_send_rtp', lose)
+                await asyncio.sleep(2.0)
+            frames = await tab.evaluate('shadowhound.video.frames')
+            await until(lambda: tab.evaluate(f'shadowhound.video.frames > {frames} + 10'), 'frames of video again')
+            assert encoder.keys > keys
+            await browser.close()
 
     asyncio.run(run())
 
@@ -177,8 +229,8 @@ class Receiver:
 
         self.video, self.codecs = video, codecs
         self.told: list[dict[str, Any]] = []
-        self.seen: list[tuple[float, int]] = []
-        """When frames arrived at the robot, ms, and their brightness."""
+        self.shown: list[tuple[int, int]] = []
+        """Time of frames, from the first, in ticks of 90 kHz, and their brightness."""
         self.pc = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
         self._task: asyncio.Task[None] | None = None
 
@@ -186,12 +238,9 @@ class Receiver:
         """Request the camera; returns the immediate response."""
         import aiortc
 
-        from shadowhound_data_logger.live.webrtc import _gather_at
-
         transceiver = self.pc.addTransceiver('video', direction='recvonly')
         known = aiortc.RTCRtpReceiver.getCapabilities('video').codecs
         transceiver.setCodecPreferences([one for name in (*self.codecs, 'video/rtx') for one in known if one.mimeType == name])
-        _gather_at(transceiver.receiver.transport.transport.iceGatherer._connection, '127.0.0.1')
 
         @self.pc.on('track')  # type: ignore[misc]
         def on_track(track: Any) -> None:
@@ -199,7 +248,7 @@ class Receiver:
 
         await self.pc.setLocalDescription(await self.pc.createOffer())
         fields = {'topic': CAMERA, 'offer': self.pc.localDescription.sdp}
-        await self.video.take(self, fields, ('127.0.0.1', '127.0.0.1'), lambda what: self.told.append(dict(what)))
+        await self.video.take(self, fields, (own_address(), own_address()), lambda what: self.told.append(dict(what)))
         if answer := self.told[0].get('answer'):
             await self.pc.setRemoteDescription(aiortc.RTCSessionDescription(answer, 'answer'))
         return self.told[0]
@@ -207,8 +256,13 @@ class Receiver:
     async def _read(self, track: Any) -> None:
         while True:
             frame = await track.recv()  # its pts begin with 0
-            if first := [what['at'] for what in self.told if 'rtp' in what]:
-                self.seen.append((first[0] + frame.pts / 90, int(frame.to_ndarray(format='rgb24')[120, 160, 1])))
+            self.shown.append((frame.pts, int(frame.to_ndarray(format='rgb24')[120, 160, 1])))
+
+    @property
+    def seen(self) -> list[tuple[float, int]]:
+        """When frames arrived at the robot, ms, and their brightness; empty while it is unknown."""
+        first_ms = first_shown_ms([what['at'] for what in self.told if 'at' in what], [pts for pts, _ in self.shown])
+        return [(first_ms + pts / 90, level) for pts, level in self.shown] if first_ms is not None else []
 
     async def has_seen(self) -> bool:
         return len(self.seen) >= 10
@@ -231,7 +285,6 @@ async def encoded() -> AsyncIterator[tuple[Any, list[float]]]:
         while True:
             at.append(round(asyncio.get_running_loop().time() * 1e3, 1))
             video.offer(LiveItem(CAMERA, 'camera', head={'at': at[-1]}, body=picture(len(at) - 1)))
-            video.tick()
             await asyncio.sleep(0.1)
 
     task = asyncio.create_task(publish())
@@ -295,7 +348,7 @@ def test_an_invalid_offer_is_answered_with_the_problem(offer: Any) -> None:
     async def run() -> None:
         video = webrtc.CameraVideo(lambda: None)
         reports: list[dict[str, Any]] = []
-        await video.take('viewer', {'topic': CAMERA, 'offer': offer}, ('127.0.0.1', '127.0.0.1'), reports.append)
+        await video.take('viewer', {'topic': CAMERA, 'offer': offer}, ('192.0.2.1', '192.0.2.7'), reports.append)
         if reports[0].get('answer') is None:
             assert reports[0]['problem']
             assert not video.topics
@@ -309,7 +362,8 @@ def test_peers_and_cameras_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     """A viewer above the limit gets an error; one that leaves makes room."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     monkeypatch.setattr(webrtc, 'MAX_PEERS', 3)
-    addresses = '127.0.0.1', '::ffff:127.0.0.1'
+    address = own_address()
+    addresses = address, f'::ffff:{address}'
 
     async def run() -> None:
         video = webrtc.CameraVideo(lambda: None)
@@ -324,12 +378,135 @@ def test_peers_and_cameras_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         assert await ask('c', '/2')
         assert not await ask('d', '/1')
         assert 'viewers take video' in fields['d']['problem']
-        assert '127.0.0.1' in fields['a']['answer']
+        assert address in fields['a']['answer']
         video.end('a')
         assert await ask('d', '/2')
         await video.close()
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize('own', ['127.0.0.1', '127.1.2.3', '::1', '::ffff:127.0.0.1'])
+def test_a_page_on_loopback_opens_no_port_on_the_network(own: str) -> None:
+    """The library listens on the addresses of the network, which a page that is only open on loopback must not do."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+
+    async def run() -> None:
+        video = webrtc.CameraVideo(lambda: None)
+        reports: list[dict[str, Any]] = []
+        await video.take('viewer', {'topic': CAMERA, 'offer': OFFER}, (own, '127.0.0.1'), reports.append)
+        assert reports == [{'problem': webrtc.ON_LOOPBACK}]
+        assert not video.topics
+        await video.close()
+
+    asyncio.run(run())
+
+
+def received(**fields: Any) -> dict[str, Any]:
+    """A report of a viewer."""
+    return {'report': {'bitrate': 400_000, 'lost': 0, 'delay': 1000.0, 'key': False, **fields}}
+
+
+def test_the_bitrate_follows_the_reports_of_the_slowest_viewer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is decreased when frames are delayed or packets are lost, at most every two seconds, and increased slowly.
+
+    Invalid reports change nothing.
+    """
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+    address, now_s = own_address(), [1000.0]
+    monkeypatch.setattr(webrtc.time, 'monotonic', lambda: now_s[0])
+
+    async def run() -> None:
+        video = webrtc.CameraVideo(lambda: None)
+        for who in ('near', 'far'):
+            await video.take(who, {'topic': CAMERA, 'offer': OFFER}, (address, address), lambda _: None)
+
+        async def rate_after(seconds: float, who: str, request: dict[str, Any]) -> int:
+            now_s[0] += seconds
+            await video.take(who, request, (address, address), lambda _: None)
+            return int(video._encoders[CAMERA].rate)
+
+        assert await rate_after(1, 'far', received()) == webrtc.FIRST_RATE
+        assert await rate_after(4, 'near', received()) == webrtc.FIRST_RATE, 'the other one has not reported'
+        assert await rate_after(0, 'far', received()) == 625_000
+        assert await rate_after(0.5, 'far', received(delay=1080.0)) == 625_000, 'noise'
+        assert await rate_after(0.5, 'far', received(delay=1110.0)) == 280_000, 'of what it received'
+        assert await rate_after(1.5, 'far', received(delay=1110.0)) == 280_000, 'too early'
+        assert await rate_after(1.0, 'far', received(lost=0.2)) == 196_000
+        for invalid in ({'lost': float('nan')}, {'lost': 1e300}, {'bitrate': '1'}, {'delay': [1]}):
+            assert await rate_after(30, 'far', received(**invalid)) == 196_000
+        assert await rate_after(30, 'far', {'report': 7}) == 196_000
+        assert await rate_after(0, 'stranger', received()) == 196_000
+        assert await rate_after(0, 'far', received()) == 245_000
+        for _ in range(20):
+            await rate_after(2.5, 'far', received(bitrate=0, delay=None, lost=1))
+        assert video._encoders[CAMERA].rate == webrtc.MIN_RATE
+        video.end('far')
+        for _ in range(20):
+            await rate_after(5, 'near', received(delay=None))
+        assert video._encoders[CAMERA].rate == webrtc.MAX_RATE
+        await video.close()
+
+    asyncio.run(run())
+
+
+def test_a_viewer_that_cannot_decode_gets_a_key_frame() -> None:
+    """Which it reports; without it there is none after the first."""
+
+    async def run() -> None:
+        async with encoded() as (video, _):
+            receiver = Receiver(video, 'video/VP8')
+            assert 'answer' in await receiver.ask()
+            await until(receiver.has_seen, 'frames of video')
+            encoder = video._encoders[CAMERA]
+            before = encoder.keys
+            await video.take(receiver, received(key=True), ('', ''), lambda _: None)
+
+            async def has_more() -> bool:
+                return bool(encoder.keys == before + 1)
+
+            await until(has_more, 'a key frame')
+            video.end(receiver)
+            await receiver.close()
+
+    asyncio.run(run())
+
+
+def test_times_are_sent_until_the_viewer_knows_the_age_of_frames() -> None:
+    """Its reports contain a delay from then on."""
+
+    async def run() -> None:
+        async with encoded() as (video, _):
+            receiver = Receiver(video, 'video/VP8')
+            assert 'answer' in await receiver.ask()
+            await until(receiver.has_seen, 'frames of video')
+            await video.take(receiver, received(), ('', ''), lambda _: None)
+            told, shown = len(receiver.told), len(receiver.shown)
+
+            async def has_seen_more() -> bool:
+                return len(receiver.shown) > shown + 5
+
+            await until(has_seen_more, 'more frames')
+            assert len(receiver.told) == told
+            video.end(receiver)
+            await receiver.close()
+
+    asyncio.run(run())
+
+
+def test_an_exact_period_does_not_make_the_age_of_a_frame_ambiguous() -> None:
+    """A receiver that missed the first frames finds their times, or none."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+    packets: list[Any] = []
+    encoder = webrtc._Vp8Encoder(packets.append)
+    for number in range(20):
+        encoder.offer(1000.0 + 100 * number, picture(number))
+        encoder._step()
+    pts = [encoded.packet.pts for encoded in packets]
+    sent = [each / 90 for each in pts]
+    assert first_shown_ms(sent, [each - pts[7] for each in pts[7:15]]) == pytest.approx(sent[7])
+    assert first_shown_ms(sent, [each - pts[7] for each in pts[7:10]]) is None, 'too few'
+    assert first_shown_ms(sent, [number * 9000 for number in range(15)]) is None
 
 
 def test_frames_of_any_size_become_video() -> None:

@@ -1,9 +1,14 @@
 // The camera as video over WebRTC: by choice, or when the robot says that the link is narrow. Frames are drawn as the JPEGs are, and
-// each has its age: the timestamps of RTP are the times at which messages came, in ticks of 90 kHz.
+// each has its age: the timestamps of RTP are the times at which messages came, in ticks of 90 kHz from a random start.
 import { html, signal } from './vendor/preact.js';
 
 const NOTHING_MS = 8000; // without a frame, and JPEGs are taken again
 const TICKS = 90;
+const REPORT_MS = 500;
+const PAIRED = 4; // frames that must match
+
+const NO_TIMES = 'this browser does not report the times of frames';
+const NOTHING = { bytesReceived: 0, packetsReceived: 0, packetsLost: 0, pliCount: 0 };
 
 export class Video {
   // onFrame is given the <video> element and when its frame came to the robot (ms, by the robot's clock).
@@ -52,7 +57,7 @@ export class Video {
       const { receiver } = pc.addTransceiver('video', { direction: 'recvonly' });
       if ('jitterBufferTarget' in receiver) receiver.jitterBufferTarget = 0;
       const element = document.createElement('video');
-      if (!element.requestVideoFrameCallback) throw new Error('this browser does not tell the times of frames');
+      if (!element.requestVideoFrameCallback) throw new Error(NO_TIMES);
       element.muted = element.playsInline = true;
       pc.ontrack = ({ track }) => {
         element.srcObject = new MediaStream([track]);
@@ -60,7 +65,10 @@ export class Video {
       };
       pc.onconnectionstatechange = () => pc === this.pc && ['failed', 'closed'].includes(pc.connectionState) && this.fail('the connection (UDP) was lost');
       element.requestVideoFrameCallback((now, frame) => this.frame(pc, element, frame));
-      this.timer = setTimeout(() => pc === this.pc && this.state.value !== 'on' && this.fail(`no frame came within ${NOTHING_MS / 1000} s`), NOTHING_MS);
+      this.sent = new Map(); // times of the first frames (ms), by tick modulo 2^32
+      this.unpaired = []; // RTP timestamps, until they are paired with the times
+      this.delays = [];
+      this.timer = setTimeout(() => pc === this.pc && this.state.value !== 'on' && this.fail(`${this.unpaired.length ? 'the age of frames was not known' : 'no frame came'} within ${NOTHING_MS / 1000} s`), NOTHING_MS);
       await pc.setLocalDescription(await pc.createOffer());
       await gathered(pc);
       if (pc === this.pc) this.link.say({ video: { topic, offer: pc.localDescription.sdp } });
@@ -72,10 +80,12 @@ export class Video {
   frame(pc, element, { rtpTimestamp }) {
     if (pc !== this.pc) return;
     element.requestVideoFrameCallback((now, frame) => this.frame(pc, element, frame));
-    if (rtpTimestamp === undefined) return this.fail('this browser does not tell the times of frames');
+    if (rtpTimestamp === undefined) return this.fail(NO_TIMES);
+    this.clock ??= this.paired(rtpTimestamp);
     if (!this.clock) return;
     const at = this.clock.at + ((rtpTimestamp - this.clock.rtp) | 0) / TICKS; // RTP's ticks are modulo 2^32
     this.clock = { rtp: rtpTimestamp, at };
+    this.delays.push(performance.now() - at);
     this.frames += 1;
     if (this.state.value !== 'on') {
       this.state.value = 'on';
@@ -84,16 +94,50 @@ export class Video {
     this.onFrame(element, at);
   }
 
+  // An RTP timestamp and its time, once several timestamps match the times that the robot sent.
+  paired(rtpTimestamp) {
+    const rtp = this.unpaired[0];
+    this.unpaired.push(rtpTimestamp);
+    for (const [tick, at] of this.sent)
+      if (this.unpaired.filter((each) => this.sent.has((each - rtp + tick) | 0)).length >= PAIRED) return { rtp, at };
+    return null;
+  }
+
+  // What came since the last report: the robot sets the bitrate from it, and sends a frame that can be decoded alone when needed.
+  async report(pc, before = NOTHING) {
+    const stats = await pc.getReceivers()[0].getStats();
+    if (pc !== this.pc) return;
+    const now = [...stats.values()].find(({ type }) => type === 'inbound-rtp') ?? before;
+    const lost = now.packetsLost - before.packetsLost;
+    this.link.say({
+      video: {
+        report: {
+          bitrate: ((now.bytesReceived - before.bytesReceived) * 8000) / REPORT_MS,
+          lost: Math.max(0, lost) / Math.max(1, lost + now.packetsReceived - before.packetsReceived),
+          delay: this.delays.sort((a, b) => a - b)[this.delays.length >> 1] ?? null,
+          key: now.pliCount > before.pliCount,
+        },
+      },
+    });
+    this.delays = [];
+    this.reporting = setTimeout(() => this.report(pc, now), REPORT_MS);
+  }
+
   // What the robot says of it.
-  async take({ answer, problem, narrow, rtp, at }) {
+  async take({ answer, problem, narrow, at }) {
     if (narrow) {
       this.narrow = true;
       this.follow();
     } else if (problem) this.fail(problem);
-    else if (rtp !== undefined) this.clock = { rtp, at };
+    else if (at !== undefined) this.sent?.set(Math.round(at * TICKS) | 0, at);
     else if (answer && this.pc) {
       const { pc } = this;
-      await pc.setRemoteDescription({ type: 'answer', sdp: answer }).catch((error) => pc === this.pc && this.fail(error.message));
+      try {
+        await pc.setRemoteDescription({ type: 'answer', sdp: answer });
+        await this.report(pc);
+      } catch (error) {
+        if (pc === this.pc) this.fail(error.message);
+      }
     }
   }
 
@@ -104,8 +148,9 @@ export class Video {
 
   stop(tells = false) {
     clearTimeout(this.timer);
+    clearTimeout(this.reporting);
     this.pc?.close();
-    this.pc = this.clock = this.topic = null;
+    this.pc = this.clock = this.sent = this.topic = null;
     this.state.value = 'off';
     if (tells) this.link.say({ video: null });
     this.onChange();
