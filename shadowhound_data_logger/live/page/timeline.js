@@ -17,17 +17,18 @@ const EVERY_MS = 5000;
 const ROW = 26;
 const LANE = 17;
 const AXIS = 26;
+const TICK = 62; // px between two times, at least
 const MINUTE = 60000;
 const DAY = 1440 * MINUTE;
 const AROUND_MS = 5000; // of a moment, on either side
 const CLICK_PX = 4; // what moves less is no drag
-const STEPS = [1, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10800].map((seconds) => seconds * 1000);
+const STEPS = [1, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10800, 14400, 21600, 43200].map((seconds) => seconds * 1000);
 const MARKED = { mission: 'A mission, from its start to its end', bag: 'A bag that was recorded', event: 'An event, at the time of its trigger', label: 'A label that an operator added' };
 const exact = (ms) => new Date(ms).toISOString().slice(11, 21);
 const named = (found) => (found?.gaps ?? []).map((row) => Object.fromEntries(found.columns.map((name, place) => [name, row[place]])));
 
-function ticks(from, to) {
-  const step = STEPS.find((each) => (to - from) / each <= 8) ?? 14400000;
+function ticks(from, to, most) {
+  const step = STEPS.find((each) => (to - from) / each <= most) ?? DAY;
   const found = [];
   for (let at = Math.ceil(from / step) * step; at < to; at += step) found.push(at);
   return found;
@@ -460,7 +461,7 @@ export function Timeline({ session }) {
         <defs><pattern id="unknown" width="6" height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">
           <rect class="unknown-back" width="6" height="6" /><rect class="unknown-line" width="2" height="6" /></pattern><${Patterns} shades=${shades} /></defs>
         <rect class="axis" x=${left} y=${height - AXIS} width=${Math.max(0, width - left - 8)} height=${AXIS} />
-        ${ticks(from, to).map((each) => html`<g><line class="tick" x1=${x(each)} x2=${x(each)} y1="0" y2=${height - AXIS} />
+        ${ticks(from, to, Math.min(8, Math.max(1, (width - left) / TICK))).map((each) => html`<g><line class="tick" x1=${x(each)} x2=${x(each)} y1="0" y2=${height - AXIS} />
           <text class="tick-label" x=${x(each)} y=${height - 7}>${clock(each, to - from < 600000)}</text></g>`)}
         ${marks.map((mark) => html`<g class=${`mark-of-${mark.kind}`} data-mark=${mark.kind} data-from=${mark.from} data-to=${mark.to} data-name=${mark.name} transform=${`translate(0 ${mark.lane * LANE})`}>
           <title>${`${mark.kind} ${mark.name}${mark.text ? ` (${mark.text})` : ''}, ${clock(mark.from)}`}</title>

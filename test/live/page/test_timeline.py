@@ -118,6 +118,11 @@ def test_the_timeline_opens_at_the_data_and_zooms_and_pans(page: Page) -> None:
     page.locator('svg[role=slider]').focus()
     page.keyboard.press('-')
     holds(page, f'{slider}.ariaValueMax - {slider}.ariaValueMin > {(last - first) * 1.9}')
+    page.set_viewport_size({'width': 390, 'height': 800})
+    page.keyboard.press('-')
+    holds(page, f'{slider}.ariaValueMax - {slider}.ariaValueMin > {(last - first) * 3.8}')
+    apart = 'boxes.length > 1 && boxes.every((box, place) => !place || boxes[place - 1].right < box.left)'
+    holds(page, f'(boxes => {apart})([...document.querySelectorAll(".tick-label")].map(label => label.getBoundingClientRect()))')
     press(page.get_by_role('button', name='Fit', exact=True))
     holds(
         page,
