@@ -29,6 +29,11 @@ RUNNING, NOT_ANSWERING, NOT_RUNNING = 'running', 'not_answering', 'not_running'
 NOT_RUNNING_TEXT: Final = 'the node is not running'
 FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining', 'waiting'})
 """States of delivery that are not a finding; ``not_draining``: another process delivers; ``waiting``: a rule delays uploads."""
+STOPPED_STORE: Final = {
+    'store_down': 'the store cannot be reached: objects wait on the disk',
+    'paused': 'an error stops uploads: objects wait on the disk',
+}
+"""The findings for the others."""
 NAMED: Final = 3
 """Topics that a finding names; the table has the others."""
 
@@ -208,7 +213,7 @@ def _faults(node: NodeStatus) -> Iterator[str]:
         what = 'objects go without a date' if node.clock.gave_up else 'objects wait for their date'
         yield f'the clock of this machine is not set: {what}'
     if store.state not in FINE_STORE:
-        yield f'delivery: {store.state.replace("_", " ")}'
+        yield STOPPED_STORE.get(store.state, f'delivery: {store.state.replace("_", " ")}')
     yield from store.stuck.values()
     yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store.blocked_buckets.items())
     yield from (f'{name} fails: {worker.last_error}' for name, worker in node.workers.items() if worker.failing)

@@ -239,12 +239,12 @@ def test_topics_without_messages_are_one_line() -> None:
 def test_problems_have_remedies() -> None:
     """The store's last error while it fails, each failing worker, and a paused node."""
     text = shown(store={'state': 'store_down', 'last_error': 'refused (is it on?)'}, paused=True,
-                 findings=('delivery: store down',),
+                 findings=('the store cannot be reached',),
                  workers={'upload': {'failing': True, 'failures': 12, 'last_error': 'OSError: no space'}})  # fmt: skip
     assert 'refused (is it on?)' in text
     assert line(text, 'upload').split() == ['upload', 'fails', '12', 'times', 'so', 'far:', 'OSError:', 'no', 'space']
     assert 'PAUSED' in text
-    assert 'delivery: store down' in text
+    assert 'the store cannot be reached' in text
     assert 'Fine' not in text
     assert 'refused' not in shown(store={'state': 'shipping', 'last_error': 'refused (is it on?)'})
 
