@@ -1,10 +1,10 @@
 """The state of a bag until it is complete in the spool: rows of the index, and a copy in a metadata record of each slice.
 
     shadowhound_recording: recording=patrol_20251018_120000 owner=thor number=3 channels=[...] slices=[...] missing=[...]
-                           said={"bag": "patrol_20251018_120000", "robot": "thor", "mission": {...}, ...} left_out=0
+                           facts={"bag": "patrol_20251018_120000", "robot": "thor", "mission": {...}, ...} left_out=0
 
-``recording`` is the name of the bag's folder. ``said``, ``channels`` and the rows of ``slices`` and ``missing`` (from before this
-slice) are as in ``model.RecordingRows``, in JSON. A later record in a slice has only ``said``, with newer information. A record
+``recording`` is the name of the bag's folder. ``facts``, ``channels`` and the rows of ``slices`` and ``missing`` (before this
+slice) are as in ``model.RecordingRows``, in JSON. A later record in a slice has only ``facts``, with newer information. A record
 takes at most a hundredth of a slice, so the oldest rows are omitted if there are too many: ``left_out`` is their number.
 
 Slices are removed from the folder as soon as they are spooled. Manifest and metadata are built from this state, also after a
@@ -106,7 +106,7 @@ class BagState:
         """The state from rows of the index, or from a slice's record. Raises BagDamaged if they are invalid."""
         state = cls(folder, folder.name, robot)
         try:
-            state._load(from_json(rows.said.encode()))
+            state._load(from_json(rows.facts.encode()))
             channels = [_read_channel(one) for one in _list(from_json(rows.channels.encode()))]
             state._channels = {_channel_id(one): one for one in channels}
             for row in rows.slices:
@@ -125,7 +125,7 @@ class BagState:
         try:
             slices = tuple(SliceRow(*_list(row)) for row in _list(from_json(record['slices'].encode())))
             missing = tuple(MissingRow(*_list(row)) for row in _list(from_json(record['missing'].encode())))
-            rows = RecordingRows(folder.name, record['said'], record['channels'], slices, missing)
+            rows = RecordingRows(folder.name, record['facts'], record['channels'], slices, missing)
             omitted = int(record['left_out'])
         except (LookupError, ValueError, TypeError) as error:
             raise BagDamaged(f'the record in a slice of bag {folder.name} is invalid: {error}', path=str(folder)) from error
@@ -165,18 +165,18 @@ class BagState:
         """The metadata record (RECORD) at the start of the slice ``number``."""
         rows = self.rows(list(self.slices.values()), len(self.missing))
         last = rows.slices[-1].bytes if rows.slices else 0
-        room = max(MIN_ROWS_BYTES, last // RECORD_SHARE - len(rows.said) - len(rows.channels))
+        room = max(MIN_ROWS_BYTES, last // RECORD_SHARE - len(rows.facts) - len(rows.channels))
         missing = _newest(rows.missing, room // 4)
         slices = _newest(rows.slices, room - len(json.dumps(missing)))
         omitted = len(rows.slices) + len(rows.missing) - len(slices) - len(missing)
         return {
-            'recording': self.folder.name, 'owner': owner, 'number': str(number), 'said': rows.said, 'channels': rows.channels,
+            'recording': self.folder.name, 'owner': owner, 'number': str(number), 'facts': rows.facts, 'channels': rows.channels,
             'slices': json.dumps(slices), 'missing': json.dumps(missing), 'left_out': str(omitted),
         }  # fmt: skip
 
     def news(self) -> dict[str, str]:
         """The metadata record for newer information within a slice."""
-        return {'said': self._description()}
+        return {'facts': self._description()}
 
     def add_slice(self, info: SliceInfo) -> RecordingRows:
         """Add a closed slice."""
@@ -208,16 +208,16 @@ class BagState:
             self.folder.rmdir()
 
     def _description(self) -> str:
-        said = _Description(self.bag, self.robot, self.mission, self.event, self.clock, self.is_named, self.ended)
-        return json.dumps(asdict(said))
+        facts = _Description(self.bag, self.robot, self.mission, self.event, self.clock, self.is_named, self.ended)
+        return json.dumps(asdict(facts))
 
     def _load(self, given: Any) -> None:
         """The inverse of ``_description``. Raises ValueError, NameRefused."""
-        check_numbers(given, 'said')
-        said = parse(_Description, given, 'said')
-        check_key(slice_file(said.bag, 0))
-        self.bag, self.mission, self.event, self.clock = said.bag, said.mission, said.event, said.clock
-        self.is_named, self.ended = said.named, said.ended
+        check_numbers(given, 'facts')
+        facts = parse(_Description, given, 'facts')
+        check_key(slice_file(facts.bag, 0))
+        self.bag, self.mission, self.event, self.clock = facts.bag, facts.mission, facts.event, facts.clock
+        self.is_named, self.ended = facts.named, facts.ended
 
     def _slice_row(self, info: SliceInfo) -> SliceRow:
         counts = json.dumps([info.channels.get(one) for one in self._channels.values()])

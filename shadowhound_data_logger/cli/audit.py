@@ -26,16 +26,16 @@ def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> 
         with (AuditProgress(the_home() / 'verify', question, again=again) as earlier,
               progress('read back' if deep else 'checked', deliveries.known(), of='objects') as bar):  # fmt: skip
             found = audit(deliveries.pages(), earlier, store, deep=deep, tell=bar.have)
-        said = _said(found, deliveries, store.describe(), deep=deep)
-        said['delivered_to'] = targets(spool)
+        report = _report(found, deliveries, store.describe(), deep=deep)
+        report['delivered_to'] = targets(spool)
     if as_json:
-        print_json(said)
+        print_json(report)
     else:
-        print_page(plain(_scope(said)), *finding_lines(said['findings'], KINDS), '', _verdict(said), *_doubt(said))
-    return exit_code(finding=not said['ok'])
+        print_page(plain(_scope(report)), *finding_lines(report['findings'], KINDS), '', _verdict(report), *_doubt(report))
+    return exit_code(finding=not report['ok'])
 
 
-def _said(found: Audit, deliveries: Deliveries, store: str, *, deep: bool) -> dict[str, Any]:
+def _report(found: Audit, deliveries: Deliveries, store: str, *, deep: bool) -> dict[str, Any]:
     return {
         'store': store, 'deep': deep, 'since_ns': deliveries.since_ns(),
         'known': deliveries.known(), 'forgotten': deliveries.forgotten(),
@@ -64,31 +64,31 @@ def finding_lines(found: Mapping[str, Any], words: Mapping[str, str]) -> Iterato
             yield f'  ... and {number(piled["count"] - len(first))} more'
 
 
-def _scope(said: Mapping[str, Any]) -> str:
-    since = said['since_ns']
-    text = f'{said["store"]} was checked for {number(said["asked"])} of {number(said["known"])} delivered objects'
-    text += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
+def _scope(report: Mapping[str, Any]) -> str:
+    since = report['since_ns']
+    text = f'{report["store"]} was checked for {number(report["asked"])} of {number(report["known"])} delivered objects'
+    text += f' ({number(report["asked_earlier"])} more by an earlier run)' if report['asked_earlier'] else ''
     if since is not None:
         text += f', those since {shown_time(since)[:19]} UTC'
-    forgotten = said['forgotten']
+    forgotten = report['forgotten']
     return f'{text}; {number(forgotten)} older ones are not remembered (spool.remember_days).' if forgotten > 0 else f'{text}.'
 
 
-def _doubt(said: Mapping[str, Any]) -> list[RenderableType]:
+def _doubt(report: Mapping[str, Any]) -> list[RenderableType]:
     """Where the node named another store than this shell does, that is the likeliest cause of what was found."""
-    if not said['findings'] or not said['delivered_to'] or said['store'] in said['delivered_to']:
+    if not report['findings'] or not report['delivered_to'] or report['store'] in report['delivered_to']:
         return []
-    other = ' and '.join(said['delivered_to'])
+    other = ' and '.join(report['delivered_to'])
     return [plain(f'But the node delivered to {other}: is AWS_ENDPOINT_URL set here as for the node?', 'yellow')]
 
 
-def _verdict(said: Mapping[str, Any]) -> Text:
-    how = 'every byte read back' if said['deep'] else 'by size and checksum'
-    if said['unreachable']:
-        left = max(said['known'] - said['asked'] - said['asked_earlier'], 0)
-        reason = plain(f': {said["unreachable"]}. {number(left)} objects are not checked yet: run it again to continue there.')
+def _verdict(report: Mapping[str, Any]) -> Text:
+    how = 'every byte read back' if report['deep'] else 'by size and checksum'
+    if report['unreachable']:
+        left = max(report['known'] - report['asked'] - report['asked_earlier'], 0)
+        reason = plain(f': {report["unreachable"]}. {number(left)} objects are not checked yet: run it again to continue there.')
         return Text.assemble(('The store cannot be reached', 'yellow'), reason)
-    if said['ok']:
+    if report['ok']:
         return Text.assemble(('All of them are there', 'green'), f', {how}.')
-    count = sum(piled['count'] for piled in said['findings'].values())
+    count = sum(piled['count'] for piled in report['findings'].values())
     return Text.assemble((f'{number(count)} are not what was delivered', 'red'), f', {how}.')

@@ -217,7 +217,7 @@ def _findings(rows: Sequence[BagRow]) -> Iterator[RenderableType]:
 
 
 def _page(found: BagInfo) -> Iterator[RenderableType]:
-    told = found.description
+    info = found.description
     yield Text.assemble(plain(found.bag, 'bold'), '  ', plain(found.state, STATES.get(found.state, 'red')))
     manifest = found.manifest
     mission, event = (manifest.mission, manifest.event) if manifest else (None, None)
@@ -225,24 +225,24 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
         'robot': found.robot or (manifest.robot if manifest else ''),
         'mission': f'{mission.type}, run {mission.run_id or "-"}, id {mission.mission_id or "-"}' if mission else '',
         'event': ', '.join(f'{each.name} by {each.by}' for each in event.triggers) if event else '',
-        'clock': _clock(told.clock, told.t_start_ns) if told.clock else '',
-        'began': f'{shown_time(told.t_start_ns)} UTC' if told.t_start_ns is not None else '-',
-        'ended': f'{shown_time(told.t_end_ns)} UTC' if told.t_end_ns is not None else '-',
-        'duration': duration(told.duration_s) if told.duration_s is not None else '-',
-        'messages': f'{number(told.messages)} on {counted(len({topic.name for topic in told.topics}), "topic")}',
+        'clock': _clock(info.clock, info.t_start_ns) if info.clock else '',
+        'began': f'{shown_time(info.t_start_ns)} UTC' if info.t_start_ns is not None else '-',
+        'ended': f'{shown_time(info.t_end_ns)} UTC' if info.t_end_ns is not None else '-',
+        'duration': duration(info.duration_s) if info.duration_s is not None else '-',
+        'messages': f'{number(info.messages)} on {counted(len({topic.name for topic in info.topics}), "topic")}',
         'size': f'{volume(found.bytes)} in {counted(len(found.files), "file")}',
-        'storage': ', '.join(filter(None, (told.storage, told.compression, f'ROS {told.distro}' if told.distro else ''))),
+        'storage': ', '.join(filter(None, (info.storage, info.compression, f'ROS {info.distro}' if info.distro else ''))),
     }  # fmt: skip
     yield value_table('', {name: value for name, value in lines.items() if value})
     yield ''
     yield _topics(found)
     yield ''
     yield _files(found)
-    yield from (plain(f'{name} {why}; it is not counted.', 'red') for name, why in told.damaged.items())
-    yield from [REPAIR] if told.damaged else []
+    yield from (plain(f'{name} {why}; it is not counted.', 'red') for name, why in info.damaged.items())
+    yield from [REPAIR] if info.damaged else []
     if found.missing:
         yield plain(f'{"Not here yet" if found.robot else "Not here"}: {", ".join(found.missing)}', 'yellow')
-    yield from remark_lines(told.remarks)
+    yield from remark_lines(info.remarks)
     yield from lost_lines(manifest.missing if manifest else ())
 
 
@@ -309,17 +309,17 @@ def _qos(profiles: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _info_json(found: BagInfo) -> dict[str, Any]:
-    told = found.description
-    times = with_dates({'t_start_ns': told.t_start_ns, 't_end_ns': told.t_end_ns}) if told.t_start_ns is not None else {}
-    parts = {part.name: with_dates(asdict(part)) for part in told.parts}
+    info = found.description
+    times = with_dates({'t_start_ns': info.t_start_ns, 't_end_ns': info.t_end_ns}) if info.t_start_ns is not None else {}
+    parts = {part.name: with_dates(asdict(part)) for part in info.parts}
     return {
-        'robot': found.robot, 'bag': found.bag, 'state': found.state, **times, 'duration_s': told.duration_s,
-        'messages': told.messages, 'bytes': found.bytes, 'storage': told.storage, 'compression': told.compression,
-        'ros_distro': told.distro, 'topics': [asdict(topic) for topic in told.topics],
+        'robot': found.robot, 'bag': found.bag, 'state': found.state, **times, 'duration_s': info.duration_s,
+        'messages': info.messages, 'bytes': found.bytes, 'storage': info.storage, 'compression': info.compression,
+        'ros_distro': info.distro, 'topics': [asdict(topic) for topic in info.topics],
         'files': [
             {**parts.get(name, {'name': name}), 'bytes': size, 'where': where} for name, (size, where) in found.files.items()
         ],
-        'clock': dict(told.clock) or None, 'missing': list(found.missing), 'damaged': dict(told.damaged),
-        'remarks': list(told.remarks), 'read_bytes': found.read_bytes,
+        'clock': dict(info.clock) or None, 'missing': list(found.missing), 'damaged': dict(info.damaged),
+        'remarks': list(info.remarks), 'read_bytes': found.read_bytes,
         'manifest': json.loads(found.manifest.to_json()) if found.manifest else None,
     }  # fmt: skip

@@ -75,8 +75,8 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str | None, as_json: bool)
         checks = [{'name': each.name, 'finding': each.finding, 'checked': each.checked} for each in found.checks]
         facts = {'bag': found.bag, 'state': found.state, 'checks': checks, 'read_bytes': found.read_bytes,
                  'missing': list(map(asdict, found.missing)), 'remarks': list(found.remarks)}  # fmt: skip
-        said = {**facts, 'is_intact': found.is_intact, 'is_complete': found.state not in {GROWING, FOREIGN}}
-        print_json(said)
+        report = {**facts, 'is_intact': found.is_intact, 'is_complete': found.state not in {GROWING, FOREIGN}}
+        print_json(report)
     else:
         print_page(*_verdict(found))
     return exit_code(finding=not (found.is_intact and found.state != GROWING))

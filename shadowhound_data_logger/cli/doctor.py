@@ -108,7 +108,7 @@ def doctor(  # noqa: PLR0913 - one for each option
     took_s = time.monotonic() - began_s
     left = [result for result in results if result.is_finding and not _is_fixed(result, fixed)]
     if as_json:
-        print_json(_said(results, fixed, context, took_s, ok=not left))
+        print_json(_report(results, fixed, context, took_s, ok=not left))
     else:
         for part in report(results, fixed, context, took_s, verbose=verbose):
             console().print(part)
@@ -142,7 +142,7 @@ def _is_fixed(result: Result, fixed: Sequence[tuple[Result, str]]) -> bool:
     return bool(result.fix) and any(one.fix == result.fix and not what.startswith('not') for one, what in fixed)
 
 
-def _said(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], context: Context, took_s: float,
+def _report(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], context: Context, took_s: float,
           *, ok: bool) -> dict[str, Any]:  # fmt: skip
     return {
         'role': context.role.value, 'robot': context.settings.robot, 'ok': ok, 'took_s': round(took_s, 3),
@@ -163,10 +163,10 @@ def report(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], conte
             '',
             *(plain(f'--fix: {what}  ({result.check})', 'red' if what.startswith('not') else 'green') for result, what in fixed),
         ]
-    told = [each for each in results if each.severity in {Severity.INFO, Severity.SKIPPED}]
-    if told:
+    notes = [each for each in results if each.severity in {Severity.INFO, Severity.SKIPPED}]
+    if notes:
         parts.append('')
-        parts += [plain(f'{each.check}: {each.seen}' + (f' ({each.cause})' if each.cause else ''), 'dim') for each in told]
+        parts += [plain(f'{each.check}: {each.seen}' + (f' ({each.cause})' if each.cause else ''), 'dim') for each in notes]
     fine = [each for each in results if each.severity is Severity.OK]
     if verbose:
         parts += ['', *(Text.assemble(('ok ', 'green'), plain(f'{each.check}: {each.seen}')) for each in fine)]

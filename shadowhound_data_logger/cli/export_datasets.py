@@ -70,10 +70,10 @@ def export_verify(*, place: str, is_all: bool, is_deep: bool, as_json: bool) -> 
 def _proof(found: VerifyResult, place: str) -> Iterator[Text]:
     for wrong in found.wrong[:SHOWN]:
         yield plain(f'  {wrong}', 'red')
-    said = f'{number(len(found.wrong))} problems' if found.wrong else 'everything is unchanged'
+    verdict = f'{number(len(found.wrong))} problems' if found.wrong else 'everything is unchanged'
     like = '' if not found.frames else f', {number(found.frames)} frames compared (lowest SSIM {found.least_ssim:.3f})'
     yield plain(f'{place}: {counted(found.episodes, "episode")}, {counted(found.files, "file")}, '
-                f'{counted(found.sources, "source")}{like}: {said}.')  # fmt: skip
+                f'{counted(found.sources, "source")}{like}: {verdict}.')  # fmt: skip
 
 
 @click.command('where', epilog=examples('export where sensor-data/thor/camera/20261121/120000_front.jpg'))

@@ -92,10 +92,10 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         keep_rows(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:
-        told = {'to': str(to), 'asked': len(requests), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
+        report = {'to': str(to), 'asked': len(requests), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
                 'unverified': found.unverified, 'failed': found.failed, 'left_out': [asdict(one) for one in left_out],
                 'took_s': round(took_s, 3)}  # fmt: skip
-        print_json(told)
+        print_json(report)
     else:
         where = f'{"" if prefix is None else f"under {prefix} "}in {Bucket(store, bucket).describe()}'
         print_lines(*_report(found, len(requests), took_s, to, where))

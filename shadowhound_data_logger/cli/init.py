@@ -121,12 +121,12 @@ def _proposals(seconds: float, namespace: str, robot: str) -> list[Proposal]:
                  for topic, types in zip(sensor.topics, sensor.types, strict=False)}  # fmt: skip
         published = ros_watch.published(node, within=namespace)
         found = {topic: others for topic, each in published.items() if (others := [one for one in each if not _is_loggers(one)])}
-        heard = ros_watch.listen(node, found, seconds, {})
-    graph = {one.topic: (one.type,) for one in heard}
+        watched = ros_watch.listen(node, found, seconds, {})
+    graph = {one.topic: (one.type,) for one in watched}
     proposals: list[Proposal] = []
     taken: set[str] = set()
     types = MessageTypes()
-    for one in sorted(heard, key=lambda one: one.topic):
+    for one in sorted(watched, key=lambda one: one.topic):
         sensor, why = _sensor(one, named, graph, taken)
         if one.unavailable:
             sensor, why = None, one.unavailable

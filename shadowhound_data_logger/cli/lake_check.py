@@ -96,16 +96,16 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
         with (AuditProgress(the_home() / 'verify', asked, again=again) as earlier,
               progress('read back' if deep else 'checked', len(rows), of='objects') as bar):  # fmt: skip
             found = audit(rows.pages(), earlier, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
-    said = {'store': where, 'catalog': catalog and str(catalog), **_said(rows, found, lacking, deep=deep)}
-    said['took_s'] = round(time.monotonic() - begun_s, 3)
-    said['left_out'] = [asdict(one) for one in left_out]
-    said['ok'] = said['ok'] and not said['left_out']
+    report = {'store': where, 'catalog': catalog and str(catalog), **_report(rows, found, lacking, deep=deep)}
+    report['took_s'] = round(time.monotonic() - begun_s, 3)
+    report['left_out'] = [asdict(one) for one in left_out]
+    report['ok'] = report['ok'] and not report['left_out']
     if as_json:
-        print_json(said)
+        print_json(report)
     else:
-        print_page(*_page(said))
+        print_page(*_page(report))
         report_skipped(left_out)
-    return exit_code(finding=not said['ok'])
+    return exit_code(finding=not report['ok'])
 
 
 @click.command(
@@ -165,7 +165,7 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
             pictures.coverage(found, f'{sink}, {span}, by {by}', chart)
             click.echo(f'Wrote {chart}', err=True)
     if as_json:
-        print_json([_told(each, by) for each in found])
+        print_json([_coverage_row(each, by) for each in found])
     else:
         print_page(*_covered(found, by))
     return report_skipped(left_out)
@@ -185,7 +185,7 @@ def _wifi(target: Path, robot: str | None, since_ns: int, until_ns: int, left_ou
     return report_skipped(left_out)
 
 
-def _told(each: Coverage, by: str) -> dict[str, Any]:
+def _coverage_row(each: Coverage, by: str) -> dict[str, Any]:
     known = each.known
     return {
         'robot': known.robot, 'sink': known.sink, 'topic': known.topic, 'since_ns': known.begin_ns, 'until_ns': known.end_ns,
@@ -234,7 +234,7 @@ def _share(part: float, whole: float) -> str:
     return '100 %' if part == whole else f'{min(99.9, max(0.1, 100 * part / whole)):.1f} %'
 
 
-def _said(rows: Rows, found: Audit, lacking: list[Any], *, deep: bool) -> dict[str, Any]:
+def _report(rows: Rows, found: Audit, lacking: list[Any], *, deep: bool) -> dict[str, Any]:
     piled = findings(found)
     if lacking:
         first = [{'bucket': one.bucket, 'key': one.key, 'detail': f'{one.size} bytes'} for one in lacking]
@@ -247,29 +247,29 @@ def _said(rows: Rows, found: Audit, lacking: list[Any], *, deep: bool) -> dict[s
     }  # fmt: skip
 
 
-def _page(said: Mapping[str, Any]) -> list[Any]:
-    by = f'its own catalog and the one in {said["catalog"]}' if said['catalog'] else 'its own catalog'
-    asked = f'{said["store"]} was checked for {number(said["asked"])} of the {number(said["known"])} objects of {by}'
-    asked += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
-    lines: list[Any] = [plain(f'{asked}, in {duration(said["took_s"])}.')]
-    if said['unproved']:
-        lines.append(plain(f'Of {number(said["unproved"])} no checksum is known: only their sizes are compared.', 'yellow'))
-    return [*lines, *finding_lines(said['findings'], WORDS), '', _verdict(said)]
+def _page(report: Mapping[str, Any]) -> list[Any]:
+    by = f'its own catalog and the one in {report["catalog"]}' if report['catalog'] else 'its own catalog'
+    asked = f'{report["store"]} was checked for {number(report["asked"])} of the {number(report["known"])} objects of {by}'
+    asked += f' ({number(report["asked_earlier"])} more by an earlier run)' if report['asked_earlier'] else ''
+    lines: list[Any] = [plain(f'{asked}, in {duration(report["took_s"])}.')]
+    if report['unproved']:
+        lines.append(plain(f'Of {number(report["unproved"])} no checksum is known: only their sizes are compared.', 'yellow'))
+    return [*lines, *finding_lines(report['findings'], WORDS), '', _verdict(report)]
 
 
-def _verdict(said: Mapping[str, Any]) -> Text:
-    how = 'every byte read back' if said['deep'] else 'by size and checksum'
-    if said['unreachable']:
+def _verdict(report: Mapping[str, Any]) -> Text:
+    how = 'every byte read back' if report['deep'] else 'by size and checksum'
+    if report['unreachable']:
         left = plain(
-            f': {said["unreachable"]}. {number(said["known"] - said["asked"] - said["asked_earlier"])} '
+            f': {report["unreachable"]}. {number(report["known"] - report["asked"] - report["asked_earlier"])} '
             'objects are not checked yet: run it again to continue there.'
         )
         return Text.assemble(('The store cannot be reached', 'yellow'), left)
-    if not said['known']:
+    if not report['known']:
         return Text.assemble(('Nothing is verified', 'yellow'), f': the catalog has no such objects.{store_hint()}')
-    if said['ok']:
+    if report['ok']:
         return Text.assemble(('All of them are there', 'green'), f', {how}.')
-    if not said['findings']:
+    if not report['findings']:
         return Text.assemble(('All objects that it names are there', 'yellow'), f', {how}; but it is not whole.')
-    wrong = len({(one['bucket'], one['key']) for piled in said['findings'].values() for one in piled['first']})
+    wrong = len({(one['bucket'], one['key']) for piled in report['findings'].values() for one in piled['first']})
     return Text.assemble((f'{number(wrong)} are not as the catalog says', 'red'), f', {how}.')

@@ -85,7 +85,7 @@ def lake_prune(
         print_page(*_planned(made, dry_run=dry_run))
     if dry_run or not (made.going or made.unfinished):
         if as_json:
-            print_json(_prune_told(made))
+            print_json(_prune_report(made))
         return exit_code(finding=made.over_bytes or report_skipped(left_out))
     if (reasons := list(_reasons(made))) and not yes:
         for reason in reasons:
@@ -99,7 +99,7 @@ def lake_prune(
     with the_store(THREADS) as target, progress() as bar:
         done = library.apply(source, target, made, now_ns=now_ns, findings=left_out, tell=bar.say)
     if as_json:
-        print_json({**_prune_told(made), 'deleted': done.objects, 'deleted_bytes': done.bytes, 'resumed': done.resumed})
+        print_json({**_prune_report(made), 'deleted': done.objects, 'deleted_bytes': done.bytes, 'resumed': done.resumed})
     else:
         click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) are deleted.')
         if done.resumed:
@@ -123,7 +123,7 @@ def _exported(say: Callable[[str], None] = lambda _: None) -> dict[tuple[str, st
     return found
 
 
-def _prune_told(made: PrunePlan) -> dict[str, Any]:
+def _prune_report(made: PrunePlan) -> dict[str, Any]:
     sensors = [{'sensor': each.sensor, 'rule': each.rule, 'objects': each.objects, 'bytes': each.bytes, 'going': each.going,
                 'going_bytes': each.going_bytes, 'protected': dict(each.protected), 'referrers': sorted(each.referrers)}
                for each in made.sensors.values()]  # fmt: skip

@@ -184,10 +184,10 @@ def page(found: LedgerPage) -> list[RenderableType]:
 
 def topics_table(found: LedgerPage) -> RenderableType:
     """One row per topic with messages; a dash is a figure that the middleware does not provide."""
-    heard = {topic: row for topic, row in found['topics'].items() if not _is_silent(row)}
-    if not heard:
+    present = {topic: row for topic, row in found['topics'].items() if not _is_silent(row)}
+    if not present:
         return Text(f'No message of {_whose(found)} has been received yet.')
-    return _table(f'Messages of {_whose(found)}', heard)
+    return _table(f'Messages of {_whose(found)}', present)
 
 
 def _is_silent(row: TopicFigures) -> bool:
@@ -304,7 +304,7 @@ def _graded_figures(part: GradeFigures) -> dict[str, int | None]:
 
 
 def _total(rows: Sequence[Mapping[str, int | None]], columns: Iterable[str]) -> dict[str, int | None]:
-    """Of topics that were heard: an estimate as soon as one figure is, None as soon as one is not known."""
+    """Of topics that were received: an estimate as soon as one figure is, None as soon as one is not known."""
     total: dict[str, int | None] = {}
     for name in columns:
         about = f'{name}_estimated'

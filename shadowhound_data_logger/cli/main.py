@@ -122,11 +122,11 @@ def main() -> None:
         code = ExitCode.USAGE if is_usage else ExitCode.FINDING
         from shadowhound_data_logger.cli.output import print_error, report_error  # noqa: PLC0415 - rich takes a while
 
-        told = described(error, sys.argv[1:])
+        described_error = described(error, sys.argv[1:])
         if wants_json(sys.argv[1:]):
-            print_error(*told, code)
+            print_error(*described_error, code)
         else:
-            report_error(*told)
+            report_error(*described_error)
         sys.exit(code)
 
 

@@ -75,7 +75,7 @@ def sync(*, as_json: bool, **given: Any) -> ExitCode:
     """Install the version that the registry selects, once."""
     with _syncing(given) as one:
         result = one.run()
-    print_json(_told(result)) if as_json else click.echo(_sentence(result))
+    print_json(_fields(result)) if as_json else click.echo(_sentence(result))
     return ExitCode.FINE
 
 
@@ -96,17 +96,17 @@ def run(*, interval: float, as_json: bool, **given: Any) -> ExitCode:
     logging.getLogger('tuf').setLevel(logging.WARNING)
     for number in (signal.SIGINT, signal.SIGTERM):  # also in the middle of a download: whatever is cut off is done again
         signal.signal(number, signal.default_int_handler)
-    said = ''
+    previous = ''
     with suppress(KeyboardInterrupt), _syncing(given) as one, _telling():
         while True:
             try:
                 result = one.run(again=False)
-                text, told = _sentence(result), _told(result)
+                text, fields = _sentence(result), _fields(result)
             except (DataLoggerError, OSError) as error:
-                text, told = f'{error}', {'error': f'{error}'}
-            if text != said:
-                said = text
-                print_json(told, is_line=True) if as_json else print(text, file=sys.stderr, flush=True)
+                text, fields = f'{error}', {'error': f'{error}'}
+            if text != previous:
+                previous = text
+                print_json(fields, is_line=True) if as_json else print(text, file=sys.stderr, flush=True)
             time.sleep(interval * random.uniform(1.0 - JITTER, 1.0 + JITTER))
     return ExitCode.FINE
 
@@ -148,16 +148,16 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
         manifest, why = folder.check(found, folder.state.read()), ''
     except PolicyRefused as error:
         manifest, why = None, f'{error.reason}: {error.what}'
-    told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions.path / found), 'refused': why,
+    fields = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions.path / found), 'refused': why,
             'isolation': folder.state.read().verified.get(found), 'stale': why_stale(folder.path, time.time_ns())}  # fmt: skip
     if manifest is not None:
-        told |= {'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
+        fields |= {'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
                  'inputs': [spec.name for spec in manifest.inputs], 'outputs': [spec.name for spec in manifest.outputs],
                  'dataset': manifest.dataset, 'run': manifest.run, 'p99_ms': manifest.p99_ms, 'bytes': manifest.size}  # fmt: skip
     if as_json:
-        print_json(told)
+        print_json(fields)
     else:
-        for key, value in told.items():
+        for key, value in fields.items():
             if value == '':
                 continue
             click.echo(f'{key}: {", ".join(value) if isinstance(value, list) else value}')
@@ -236,7 +236,7 @@ def report(*, failures: int, p99_ms: float, as_json: bool) -> ExitCode:
     return exit_code(finding=not is_good)
 
 
-def _told(result: SyncResult) -> dict[str, object]:
+def _fields(result: SyncResult) -> dict[str, object]:
     return {'wanted': result.wanted, 'active': result.active, 'done': result.done, 'p99_ms': result.p99_ms,
             'fetched_bytes': result.fetched_bytes, 'begun_anew': result.restarted_files, 'stale': result.stale,
             'isolation': result.isolation}  # fmt: skip

@@ -82,11 +82,11 @@ def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encry
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         private = place / f'{person}{files.PRIVATE}'
         keyid, public = files.make_key(private, passphrase).public_key.keyid, private.with_suffix(files.PUBLIC)
-        told: dict[str, object] = {'key': keyid, 'private': str(private), 'public': str(public)}
+        report: dict[str, object] = {'key': keyid, 'private': str(private), 'public': str(public)}
         lines = [f'{private}: keep it', f'{public}: for who runs policy keys or policy delegate']
     else:
         found = roots.create(place, [files.load_public(path) for path in publics], threshold, passphrase)
-        told = {'folder': str(place), 'root': str(place / ROOT), 'missing_signatures': found.missing}
+        report = {'folder': str(place), 'root': str(place / ROOT), 'missing_signatures': found.missing}
         lines = [
             f'{place / roots.TARGETS_KEY}: signs versions; stays with who publishes',
             f'{place / roots.ONLINE_KEY}: dates what is signed, for policy publish and a daily policy refresh',
@@ -95,7 +95,7 @@ def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encry
         ]  # fmt: skip
         if not publics:
             lines.insert(0, f'{place / roots.ROOT_KEY}: move it offline, to two places; it replaces all other keys')
-    print_json(told) if as_json else click.echo('\n'.join(lines))
+    print_json(report) if as_json else click.echo('\n'.join(lines))
     return ExitCode.FINE
 
 
@@ -111,8 +111,8 @@ def sign_root(*, root: Path, key: Path, as_json: bool) -> ExitCode:
         click.echo('\n'.join(lines))  # before the prompt for the passphrase
     found = roots.sign_root(root, key, _passphrase)
     missing = f', {found.missing} missing' if found.missing else ': complete'
-    told = {'root': str(root), 'content': lines, 'signatures': found.signed, 'missing_signatures': found.missing}
-    print_json(told) if as_json else click.echo(f'{found.signed} signatures{missing}')
+    report = {'root': str(root), 'content': lines, 'signatures': found.signed, 'missing_signatures': found.missing}
+    print_json(report) if as_json else click.echo(f'{found.signed} signatures{missing}')
     return ExitCode.FINE
 
 
@@ -155,9 +155,9 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
             lines.append(f'copy {place / roots.ONLINE_KEY} to where policy refresh runs')
         if (place / roots.ROOT_KEY).is_file():
             lines.append(f'move {place / roots.ROOT_KEY} offline')
-    told = {'folder': str(place), 'root_version': found.version, 'missing_signatures': found.missing, 'listed': listed,
+    report = {'folder': str(place), 'root_version': found.version, 'missing_signatures': found.missing, 'listed': listed,
             'no_longer_listed': gone}  # fmt: skip
-    print_json(told) if as_json else click.echo('\n'.join(lines))
+    print_json(report) if as_json else click.echo('\n'.join(lines))
     return ExitCode.FINE
 
 
@@ -197,10 +197,10 @@ def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
     with _signing(folder, expires / DAY_NS) as signing:
         state = signing.refresh()
         listed = signing.listed()
-    told = {'expires': f'{state.expires:%Y-%m-%dT%H:%M:%SZ}', 'root_expires': f'{state.root.signed.expires:%Y-%m-%dT%H:%M:%SZ}',
+    report = {'expires': f'{state.expires:%Y-%m-%dT%H:%M:%SZ}', 'root_expires': f'{state.root.signed.expires:%Y-%m-%dT%H:%M:%SZ}',
             'listed': listed, 'soon': (soon := [*state.expiring()])}  # fmt: skip
-    fresh = f'fresh until {told["expires"]}; the root until {told["root_expires"]}; {len(listed)} versions are listed'
-    print_json(told) if as_json else click.echo('\n'.join((fresh, *soon)))
+    fresh = f'fresh until {report["expires"]}; the root until {report["root_expires"]}; {len(listed)} versions are listed'
+    print_json(report) if as_json else click.echo('\n'.join((fresh, *soon)))
     return exit_code(finding=soon)
 
 
@@ -232,8 +232,8 @@ def pack(*, folder: Path, name: str, version: int | None, smoke: Path, to: Path,
     """
     number = version or 1 + max((each.version for each in registry().versions(name)), default=0)
     manifest = packing.pack(folder, smoke, to, packing.Packing(name=name, version=number, run=run_id, **given))
-    told = {'policy': manifest.id, 'folder': str(to), 'files': len(manifest.files), 'bytes': manifest.size}
-    print_json(told) if as_json else click.echo(f'{manifest.id}: {len(manifest.files)} files, {manifest.size:,} bytes in {to}')
+    report = {'policy': manifest.id, 'folder': str(to), 'files': len(manifest.files), 'bytes': manifest.size}
+    print_json(report) if as_json else click.echo(f'{manifest.id}: {len(manifest.files)} files, {manifest.size:,} bytes in {to}')
     return ExitCode.FINE
 
 
@@ -260,11 +260,11 @@ def publish(
     """
     with the_store() as store:
         signing = _signers()[2].Repository(_keys_folder(folder), store, _passphrase)
-        manifest, is_told = packing.publish(packed, store, registry(), signing, key=key, aliases=aliases, robots=robots)
-    told = {'policy': manifest.id, 'aliases': list(aliases), 'robots': list(robots), 'refreshed': is_told}
+        manifest, is_refreshed = packing.publish(packed, store, registry(), signing, key=key, aliases=aliases, robots=robots)
+    report = {'policy': manifest.id, 'aliases': list(aliases), 'robots': list(robots), 'refreshed': is_refreshed}
     text = f'published {manifest.id}{" as " if aliases else ""}{", ".join(aliases)}'
-    print_json(told) if as_json else click.echo(
-        text if is_told else f'{text}; robots take it after policy refresh, where online.key is'
+    print_json(report) if as_json else click.echo(
+        text if is_refreshed else f'{text}; robots take it after policy refresh, where online.key is'
     )
     return ExitCode.FINE
 
@@ -284,10 +284,10 @@ def withdraw(*, name: str, robot_types: tuple[str, ...], key: Path | None, folde
     if not version.isdecimal():
         raise BadUsage(f'{name!r} is not a version', 'such as go2_patrol@7')
     with _signing(folder) as signing:
-        is_told = signing.withdraw([target_of(kind, policy_name, int(version)) for kind in robot_types], key)
-    text = f'{name} is no longer listed{"" if is_told else "; robots learn of it after policy refresh, where online.key is"}'
-    told = {'withdrawn': name, 'robot_types': list(robot_types), 'refreshed': is_told}
-    print_json(told) if as_json else click.echo(text)
+        is_refreshed = signing.withdraw([target_of(kind, policy_name, int(version)) for kind in robot_types], key)
+    text = f'{name} is no longer listed{"" if is_refreshed else "; robots learn of it after policy refresh, where online.key is"}'
+    report = {'withdrawn': name, 'robot_types': list(robot_types), 'refreshed': is_refreshed}
+    print_json(report) if as_json else click.echo(text)
     return ExitCode.FINE
 
 
@@ -295,8 +295,8 @@ def withdraw(*, name: str, robot_types: tuple[str, ...], key: Path | None, folde
 
 
 def _new_passphrase() -> str:
-    told = os.environ.get('SHADOWHOUND_KEY_PASSPHRASE')
-    return told or str(click.prompt('passphrase of the new keys', hide_input=True, confirmation_prompt=True, err=True))
+    passphrase = os.environ.get('SHADOWHOUND_KEY_PASSPHRASE')
+    return passphrase or str(click.prompt('passphrase of the new keys', hide_input=True, confirmation_prompt=True, err=True))
 
 
 def _keys_folder(folder: Path | None) -> Path:

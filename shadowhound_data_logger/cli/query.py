@@ -230,11 +230,11 @@ def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: b
         for bucket, key in zip(found['bucket'].to_pylist(), found['key'].to_pylist(), strict=True):
             click.echo(visible(f'{bucket}/{key}'))
     elif kind == 'json':
-        print_json([_told(row) for row in found.to_pylist()])
+        print_json([_json_row(row) for row in found.to_pylist()])
     elif kind == 'csv':
         writer = csv.writer(sys.stdout, lineterminator='\n')
         writer.writerow(map(csv_cell, found.column_names))
-        writer.writerows(map(csv_cell, _told(row).values()) for row in found.to_pylist())
+        writer.writerows(map(csv_cell, _json_row(row).values()) for row in found.to_pylist())
     else:
         print_page(*_table(found, where, is_objects=is_objects, is_limited=is_limited, by=by))
 
@@ -280,7 +280,7 @@ def _cell(name: str, value: Any) -> str:
     return number(value) if isinstance(value, int) and not isinstance(value, bool) else str(value)
 
 
-def _told(row: Mapping[str, Any]) -> dict[str, Any]:
+def _json_row(row: Mapping[str, Any]) -> dict[str, Any]:
     return {name: f'{value:%Y-%m-%dT%H:%M:%S.%fZ}' if isinstance(value, datetime) else value for name, value in row.items()}
 
 

@@ -99,10 +99,10 @@ def _ranges(file: Any) -> list[Any] | None:
     if file is None:
         return None
     try:
-        told = from_json(file.read(MAX_DOCUMENT_BYTES + 1))
+        document = from_json(file.read(MAX_DOCUMENT_BYTES + 1))
     except ValueError as error:
         raise BadUsage(f'--ranges {file.name}: {error}', _RANGES) from error
-    found = told.get('ranges') if isinstance(told, dict) else told
+    found = document.get('ranges') if isinstance(document, dict) else document
     if not isinstance(found, list):
         raise BadUsage(f'--ranges {file.name} is not a list of times', _RANGES)
     return found
@@ -110,11 +110,11 @@ def _ranges(file: Any) -> list[Any] | None:
 
 def question_text(flags: Mapping[str, Any]) -> str:
     """The query, as the title of a picture."""
-    told = {**flags, 'success': {True: 'succeeded', False: 'failed'}.get(flags.get('success'), '')}  # type: ignore[arg-type]
+    values = {**flags, 'success': {True: 'succeeded', False: 'failed'}.get(flags.get('success'), '')}  # type: ignore[arg-type]
     return ', '.join(
-        str(told[name]) if name in {'sensor', 'success'} else f'{name} {told[name]}'
+        str(values[name]) if name in {'sensor', 'success'} else f'{name} {values[name]}'
         for name in NAMES
-        if name != 'ranges' and told.get(name)
+        if name != 'ranges' and values.get(name)
     )
 
 

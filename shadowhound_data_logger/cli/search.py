@@ -38,7 +38,7 @@ from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import FLAGS, asking, quietly, report_skipped
 
 FILE: Final = 'search.db'
-MAX_SAID: Final = 80
+MAX_TEXT: Final = 80
 """Letters of a document in the table; JSON has all."""
 _ASKED: Final = ('robot', 'since', 'until', 'mission', 'mission_type', 'success', 'label', 'ranges')
 _URL: Final = re.compile(r's3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])/([^/].*[^/])')
@@ -94,10 +94,10 @@ def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None
     table = plain_table('', columns, columns)
     table.title = None
     for each in found:
-        said = each['title'] if not each['excerpt'] or each['excerpt'] == each['title'] else f'{each["title"]}: {each["excerpt"]}'
-        said = said.removeprefix(': ')
+        text = each['title'] if not each['excerpt'] or each['excerpt'] == each['title'] else f'{each["title"]}: {each["excerpt"]}'
+        text = text.removeprefix(': ')
         cells = [each['kind'], each['robot'], shown_time(each['since_ns']), each['mission_id'] or '-',
-                 said if len(said) <= MAX_SAID else f'{said[:MAX_SAID]} ...', ', '.join(each['labels'])]  # fmt: skip
+                 text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} ...', ', '.join(each['labels'])]  # fmt: skip
         table.add_row(*map(plain, cells[: len(columns)]))
     until = f'up to {shown_time(fresh_ns)}' if fresh_ns is not None else 'up to a time that is not known'
     more = f'; {counted(waiting, "mission")} had no summary yet' if waiting else ''

@@ -160,8 +160,8 @@ def _overview(folder: Path, *, as_json: bool) -> ExitCode:
     running = [name for name in robots(folder) if read_status(folder, name, clock).running]
     quarantined = sum(usage.objects for usage in found if usage.state == State.QUARANTINED.value)
     if as_json:
-        said = [{**asdict(usage), 'oldest': iso(usage.oldest_ns)} for usage in found]
-        print_json({'spool': str(folder), 'running': running, 'heaps': said, 'quarantined': quarantined})
+        heaps = [{**asdict(usage), 'oldest': iso(usage.oldest_ns)} for usage in found]
+        print_json({'spool': str(folder), 'running': running, 'heaps': heaps, 'quarantined': quarantined})
     else:
         print_page(*_view(folder, found, running, clock))
     return exit_code(finding=quarantined)
@@ -241,14 +241,14 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> ExitCode:
         ):
             _wait(spool, uploader, writer, catalog, patience_s, bar)
             writer.flush(CLOSE_S)
-            said = {'store': where, **_drained(folder, spool, uploader.status())}
+            report = {'store': where, **_drained(folder, spool, uploader.status())}
     except (OSError, sqlite3.Error) as error:
         raise SpoolError(f'the spool {folder} cannot be used: {error}') from error
     if as_json:
-        print_json(said)
+        print_json(report)
     else:
-        click.echo(_told(said))
-    return exit_code(finding=not said['ok'])
+        click.echo(_drained_lines(report))
+    return exit_code(finding=not report['ok'])
 
 
 def _destination(folder: Path, settings: Settings) -> str:
@@ -297,12 +297,12 @@ def _drained(folder: Path, spool: Spool, status: UploadStatus) -> dict[str, Any]
     }  # fmt: skip
 
 
-def _told(said: dict[str, Any]) -> str:
-    lines = [f'{counted(said["delivered"], "object")} delivered to {said["store"]} and confirmed']
-    if said['pending']:
-        lines.append(f'{counted(said["pending"], "object")} still waiting: {said["last_error"] or "try again later"}')
-    if said['held']:
-        lines.append(f'{counted(said["held"], "object")} without a name yet (shadowhound-data spool)')
-    if said['quarantined']:
-        lines.append(f'{counted(said["quarantined"], "object")} quarantined (shadowhound-data spool)')
+def _drained_lines(report: dict[str, Any]) -> str:
+    lines = [f'{counted(report["delivered"], "object")} delivered to {report["store"]} and confirmed']
+    if report['pending']:
+        lines.append(f'{counted(report["pending"], "object")} still waiting: {report["last_error"] or "try again later"}')
+    if report['held']:
+        lines.append(f'{counted(report["held"], "object")} without a name yet (shadowhound-data spool)')
+    if report['quarantined']:
+        lines.append(f'{counted(report["quarantined"], "object")} quarantined (shadowhound-data spool)')
     return '\n'.join(lines)

@@ -248,7 +248,7 @@ class RecordingRows:
 
     folder: str
     """The name of its folder, unique among the recordings of its owner."""
-    said: str = ''
+    facts: str = ''
     """JSON: facts about it (``bags.state``)."""
     channels: str = ''
     """JSON: a list of its channels without definitions, in order of first appearance."""

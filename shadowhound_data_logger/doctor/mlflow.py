@@ -66,9 +66,9 @@ def check(context: Context) -> Iterator[Result]:
 
 
 def _health(rest: MlflowRest, url: str) -> Iterator[Result]:
-    said = rest.get('/health')
-    if said != 'OK':
-        raise TrackingUnavailable(f'{url} does not answer like an MLflow server: /health returns {said[:40]!r}', code='')
+    answer = rest.get('/health')
+    if answer != 'OK':
+        raise TrackingUnavailable(f'{url} does not answer like an MLflow server: /health returns {answer[:40]!r}', code='')
     version = rest.get('/version')
     yield ok('mlflow.health', f'MLflow {version} answers', version=version)
 

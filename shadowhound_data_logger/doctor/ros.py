@@ -117,21 +117,21 @@ def check(context: Context) -> Iterator[Result]:
                 resolved[topic], found[topic] = topic, publishers
         if publishers := ros_watch.publishers_of(node, TF):
             found[TF] = publishers
-        heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
-        others = [] if heard else list(ros_watch.published(node))
+        watched = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
+        others = [] if watched else list(ros_watch.published(node))
         waiting = ros_watch.waiting_for_clock(node)
     yield from _clock(waiting)
     configured = [sensor for sensor in sensors if sensor.name in own]
-    yield from _types(configured, packages | {DRIVER} if not heard and is_go2(context) else packages)
-    if not heard:
+    yield from _types(configured, packages | {DRIVER} if not watched and is_go2(context) else packages)
+    if not watched:
         yield from _no_publishers(context, names, listener, others)
         return
-    if TF in heard:
-        yield from _transforms(heard[TF])
+    if TF in watched:
+        yield from _transforms(watched[TF])
     is_complete = context.settings.capture.topics == NAMED or DRIVER in packages
     streams = STREAMS if is_unitree else {}
     for sensor in sensors:
-        topics = [heard[resolved[topic]] for topic in sensor.topics]
+        topics = [watched[resolved[topic]] for topic in sensor.topics]
         if is_complete or any(one.publishers for one in topics):  # only the driver of a Go2 publishes all of the default sensors
             yield from _sensor(sensor, topics, context.rates_hz, streams)
 
@@ -305,15 +305,15 @@ def _peek(domain: int, topics: Sequence[str], listener: Middleware | None) -> li
 
 
 def _sensor(
-    sensor: SensorSettings, heard: Sequence[WatchedTopic], rates_hz: Mapping[str, float], streams: Mapping[str, Stream]
+    sensor: SensorSettings, watched: Sequence[WatchedTopic], rates_hz: Mapping[str, float], streams: Mapping[str, Stream]
 ) -> Iterator[Result]:
     """A sensor is present if one of its topics is; each topic that is present is checked.
 
     ``rates_hz`` are those that the user expects, ``streams`` has what is known about the topics of this kind of robot.
     """
-    present = [(topic, one) for topic, one in zip(sensor.topics, heard, strict=True) if one.publishers]
+    present = [(topic, one) for topic, one in zip(sensor.topics, watched, strict=True) if one.publishers]
     if not present:
-        names = ' nor '.join(one.topic for one in heard)
+        names = ' nor '.join(one.topic for one in watched)
         stream = streams.get(sensor.topics[0], UNKNOWN)
         if stream.optional:
             yield info('ros.topic', f'{names} has no publisher', 'many robots have none')
@@ -322,7 +322,7 @@ def _sensor(
                 'ros.topic',
                 f'{names} has no publisher',
                 f'{sensor.name} is not logged',
-                f'ros2 topic list | grep {heard[0].topic} ; is this part of the driver running? If not: {sensor.name}.enabled: '
+                f'ros2 topic list | grep {watched[0].topic} ; is this part of the driver running? If not: {sensor.name}.enabled: '
                 'false in the parameter file',
             )
         return

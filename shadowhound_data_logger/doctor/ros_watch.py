@@ -123,8 +123,8 @@ def _nodes(found: Mapping[str, Sequence[Endpoint]]) -> dict[str, list[str]]:
 
 def listen(ros_node: Node, found: dict[str, list[Endpoint]], window_s: float, types: Mapping[str, str]) -> list[WatchedTopic]:
     """Count the messages of each topic that has publishers; ``types`` are those in the settings, by topic."""
-    heard = [WatchedTopic(topic, publishers, logged_type(publishers, types.get(topic))) for topic, publishers in found.items()]
-    readers = [(one, reader) for one in heard for reader in _readers(ros_node, one)]
+    watched = [WatchedTopic(topic, publishers, logged_type(publishers, types.get(topic))) for topic, publishers in found.items()]
+    readers = [(one, reader) for one in watched for reader in _readers(ros_node, one)]
     try:
         settled = time.monotonic() + SETTLE_S
         while time.monotonic() < settled:
@@ -135,13 +135,13 @@ def listen(ros_node: Node, found: dict[str, list[Endpoint]], window_s: float, ty
             _drain(readers, count=True)
             time.sleep(POLL_S)
         _drain(readers, count=True)
-        for one in heard:
+        for one in watched:
             one.window_s = time.monotonic() - began
             one.incompatible = _incompatible_subscribers(ros_node, one.topic)
     finally:
         for _, reader in readers:
             reader.close()
-    return heard
+    return watched
 
 
 def publishers_of(ros_node: Node, topic: str) -> list[Endpoint]:

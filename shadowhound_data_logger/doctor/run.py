@@ -79,7 +79,7 @@ class Examination:
         self._running: dict[str, Running] = {}
         self._found: dict[str, list[Result]] = {check.name: [] for check in checks}
         self._ended: set[str] = set()
-        self._heard: queue.Queue[_Message] = queue.Queue()
+        self._results: queue.Queue[_Message] = queue.Queue()
 
     def run(self) -> list[Result]:
         """All results, in the order of the checks."""
@@ -105,11 +105,11 @@ class Examination:
             running = self._running[check.name] = Running(check, until_s)
             earlier = {name: tuple(self._found.get(name, ())) for name in check.after}
             context = replace(self._context, earlier=earlier)
-            threading.Thread(target=_work, args=(running, context, self._heard.put), name=check.name, daemon=True).start()
+            threading.Thread(target=_work, args=(running, context, self._results.put), name=check.name, daemon=True).start()
 
     def _collect(self, until_s: float) -> None:
         try:
-            name, result = self._heard.get(timeout=max(0.0, until_s - time.monotonic()))
+            name, result = self._results.get(timeout=max(0.0, until_s - time.monotonic()))
         except queue.Empty:
             return
         if name not in self._running:
@@ -121,7 +121,7 @@ class Examination:
 
     def _give_up(self, now_s: float) -> None:
         for name, running in list(self._running.items()):
-            if now_s < running.until_s or not self._heard.empty():
+            if now_s < running.until_s or not self._results.empty():
                 continue
             running.give_up()
             self._found[name].append(_timed_out(running.check, min(self._patience * running.check.deadline_s, self._timeout_s)))

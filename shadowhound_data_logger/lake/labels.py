@@ -83,8 +83,8 @@ class Label:
             is_path(self.key) and self.key.startswith(f'{self.robot}/') and is_name(self.bucket or '')
         ):
             raise SettingError('key', self.key[:200], f'the key of an object of {self.robot}, which starts with {self.robot}/')
-        said = [self.robot, self.label, self.since_ns, self.until_ns, self.bucket, self.key, *box]
-        return replace(self, id=hashlib.blake2b('\0'.join(map(str, said)).encode(), digest_size=8).hexdigest())
+        identity = [self.robot, self.label, self.since_ns, self.until_ns, self.bucket, self.key, *box]
+        return replace(self, id=hashlib.blake2b('\0'.join(map(str, identity)).encode(), digest_size=8).hexdigest())
 
 
 FIELDS: Final = tuple(each.name for each in fields(Label))
@@ -99,8 +99,8 @@ def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is
     rows: list[Row] = []
     for each in found:
         one = each.checked()
-        said = {name: getattr(one, name) for name in FIELDS}
-        rows.append({**said, 'what': REMOVED if is_removal else LABEL, 'by': by, 'made_ns': made_ns, 'made': made_ns // 1000,
+        columns = {name: getattr(one, name) for name in FIELDS}
+        rows.append({**columns, 'what': REMOVED if is_removal else LABEL, 'by': by, 'made_ns': made_ns, 'made': made_ns // 1000,
                      'format_version': 1})  # fmt: skip
     body = parts.encode(rows, LABELS)
     digest = hashlib.blake2b(body, digest_size=8).hexdigest()
@@ -150,7 +150,7 @@ def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
     The rows need the columns ``robot bucket key t_start_ns t_end_ns``.
     """
     of_keys: dict[tuple[str, str], set[str]] = {}
-    said: list[set[str]] = [set() for _ in range(len(rows))]
+    labels: list[set[str]] = [set() for _ in range(len(rows))]
     first = pc.fill_null(rows['t_start_ns'], -1).to_numpy()
     last = np.maximum(first, pc.fill_null(rows['t_end_ns'], -1).to_numpy())
     robots_of = np.array(rows['robot'].to_pylist(), object)
@@ -161,11 +161,11 @@ def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
         for index in np.flatnonzero(
             (robots_of == each.robot) & (first <= each.until_ns) & (last >= each.since_ns) & (first >= 0)
         ):
-            said[int(index)].add(each.label)
+            labels[int(index)].add(each.label)
     if of_keys:
         for number, name in enumerate(zip(rows['bucket'].to_pylist(), rows['key'].to_pylist(), strict=True)):
-            said[number] |= of_keys.get(name, set())
-    return [sorted(each) for each in said]
+            labels[number] |= of_keys.get(name, set())
+    return [sorted(each) for each in labels]
 
 
 def with_column(rows: pa.Table, found: Sequence[Label]) -> pa.Table:

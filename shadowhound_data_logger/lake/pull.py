@@ -147,9 +147,9 @@ def cancel(store: ObjectStore, source: Bucket, robot: str, request: str, *, by: 
     def add(entries: list[Any]) -> list[Any]:
         left = _unanswered(source, robot, entries)
         made_ns = max((asked.made_ns + 1 for asked in _requests(robot, left) if asked.id == request), default=0)
-        said = PullCancel(id=request, by=by, made_ns=max(time.time_ns(), made_ns)).to_json()
-        _checked(robot, said)
-        return [*left, said]
+        cancellation = PullCancel(id=request, by=by, made_ns=max(time.time_ns(), made_ns)).to_json()
+        _checked(robot, cancellation)
+        return [*left, cancellation]
 
     _change(store, robot, add)
 

@@ -134,8 +134,8 @@ class Cuts:
             stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, env=dict(os.environ),
         )  # fmt: skip
         try:
-            told, wrong = await asyncio.wait_for(process.communicate(), CUT_S)
-            return dict(json.loads(told))
+            output, wrong = await asyncio.wait_for(process.communicate(), CUT_S)
+            return dict(json.loads(output))
         except (asyncio.TimeoutError, asyncio.CancelledError) as error:
             process.kill()
             await process.wait()

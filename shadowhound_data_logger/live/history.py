@@ -277,8 +277,8 @@ class PastReader:
 
     def _bag_marks(self, robot: str, begin_ns: int, end_ns: int, by: str) -> Iterator[_Mark]:
         bags = self._source.bag_files(robot, begin_ns, end_ns, by)
-        told = self._pool.map(self._contents.manifest, bags.values())
-        for (bag, files), manifest in zip(bags.items(), told, strict=True):
+        manifests = self._pool.map(self._contents.manifest, bags.values())
+        for (bag, files), manifest in zip(bags.items(), manifests, strict=True):
             slices = manifest.slices if manifest is not None else ()
             first_ns = min((one.t_start_ns for one in slices), default=min(one.begin_ns for one in files))
             last_ns = max((one.t_end_ns for one in slices), default=max(one.end_ns for one in files))
@@ -411,8 +411,8 @@ class PastReader:
         rows: list[tuple[float, Mapping[str, float]]] = []
         name = ''
         for one in objects[-MAX_TOPICS:]:
-            told, samples = _samples(self._contents.get(one))
-            name = one.type or told
+            type_name, samples = _samples(self._contents.get(one))
+            name = one.type or type_name
             kind = KINDS.get(name)
             if kind is None or kind.values is None:
                 return None
@@ -791,8 +791,8 @@ def _image_item(topic: str, extension: str, body: bytes, at_ms: float) -> LiveIt
 def _samples(body: bytes) -> tuple[str, list[dict[str, Any]]]:
     """The type named in a document, and its messages."""
     found = decode.records(body)
-    told = json.loads(body).get('type')
-    return told if isinstance(told, str) else '', found
+    type_name = json.loads(body).get('type')
+    return type_name if isinstance(type_name, str) else '', found
 
 
 def _message_times(one: PastObject, stamps_ns: Sequence[int], by: str) -> list[int]:
@@ -857,8 +857,8 @@ def main() -> None:
             head = {'error': visible(str(error))[:1000], 'is_wrong': isinstance(error, (LabelRefused, PullRefused))}
         except (*_BROKEN, LakeError, BagDamaged) as error:
             head = {'error': f'this cannot be read: {type(error).__name__}: {visible(str(error))[:300]}', 'is_wrong': True}
-        told = json.dumps(head, separators=(',', ':')).encode()
-        out.write(len(told).to_bytes(4, 'little') + len(body).to_bytes(4, 'little') + told + body)
+        encoded_head = json.dumps(head, separators=(',', ':')).encode()
+        out.write(len(encoded_head).to_bytes(4, 'little') + len(body).to_bytes(4, 'little') + encoded_head + body)
         out.flush()
 
 

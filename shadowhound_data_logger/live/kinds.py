@@ -193,7 +193,7 @@ def _joints(message: Any) -> dict[str, float]:
 
 
 def _joints_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
-    told, rows = b'', []
+    name_bytes, rows = b'', []
     for cdr in cdrs:
         begin = place = _after_text(cdr, _FRAME_ID)
         (count,) = _LENGTH.unpack_from(cdr, place)
@@ -202,28 +202,28 @@ def _joints_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
         place += 4
         for _ in range(count):
             place = _after_text(cdr, place)
-        told = told or cdr[begin:place]
+        name_bytes = name_bytes or cdr[begin:place]
         position = _align_double(place + 4)
         lengths = []
         for _ in range(3):  # position, velocity, effort
             (length,) = _LENGTH.unpack_from(cdr, place)
             place = _align_double(place + 4) + 8 * length if length else place + 4
             lengths.append(length)
-        if lengths[0] < count or len(cdr) < place or not cdr.startswith(told, begin):
+        if lengths[0] < count or len(cdr) < place or not cdr.startswith(name_bytes, begin):
             return None
         rows.append(struct.pack(f'<{count}f', *struct.unpack_from(f'<{count}d', cdr, position)))
-    names = _joint_names(told)
+    names = _joint_names(name_bytes)
     return None if names is None else (names, b''.join(rows))
 
 
 @lru_cache(maxsize=16)
-def _joint_names(told: bytes) -> list[str] | None:
+def _joint_names(name_bytes: bytes) -> list[str] | None:
     """Names in a sequence of strings in CDR; None if two are equal."""
     names, place = [], 4
-    while place < len(told):
-        (length,) = _LENGTH.unpack_from(told, place)
-        names.append(told[place + 4 : place + 3 + length].decode('utf-8', 'replace')[:MAX_NAME])
-        place = _after_text(told, place)
+    while place < len(name_bytes):
+        (length,) = _LENGTH.unpack_from(name_bytes, place)
+        names.append(name_bytes[place + 4 : place + 3 + length].decode('utf-8', 'replace')[:MAX_NAME])
+        place = _after_text(name_bytes, place)
     return names if len({*names}) == len(names) else None
 
 

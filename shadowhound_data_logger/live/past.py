@@ -138,11 +138,11 @@ class PastDay:
     @cached_property
     def missions(self) -> list[PastMission]:
         known = self._rows.select(['mission_id', 'mission_type', 't_start_ns', 't_end_ns'])
-        told = known.group_by('mission_id').aggregate([('mission_type', 'max'), ('t_start_ns', 'min'), ('t_end_ns', 'max')])
+        missions = known.group_by('mission_id').aggregate([('mission_type', 'max'), ('t_start_ns', 'min'), ('t_end_ns', 'max')])
         return [
             PastMission(row['mission_id'], row['mission_type_max'] or '', row['t_start_ns_min'],
                         max(row['t_start_ns_min'], row['t_end_ns_max'] or 0))
-            for row in told.to_pylist() if row['mission_id']
+            for row in missions.to_pylist() if row['mission_id']
         ]  # fmt: skip
 
     @cached_property

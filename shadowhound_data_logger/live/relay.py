@@ -166,15 +166,15 @@ class Relay:
 
     async def _send_topics(self, connection: _Connection) -> None:
         """Send the watched topics when they change, and a ping each second."""
-        told: list[str] | None = None
+        sent: list[str] | None = None
         while True:
             wanted = self._wanted()
             if wanted is None:
                 connection.is_closing = True
                 await connection.ws.close()
                 return
-            if (topics := sorted(wanted)) != told:
-                told = topics
+            if (topics := sorted(wanted)) != sent:
+                sent = topics
                 await connection.ws.send_json({'watch': topics})
             await connection.ws.send_json({'ping': time.monotonic() * 1e3})
             self._wake.clear()
@@ -241,8 +241,10 @@ class _Connection:
             self._pings.append((here - float(head['ping']), float(head['now']) - (here + float(head['ping'])) / 2))
             return
         if kind == 'topics':
-            told = [[*(str(text)[:256] for text in row[:3]), int(row[3])] for row in head['topics'][:MAX_TOPICS] if len(row) == 4]
-            self._on_item(_catalog(told, str(head.get('problem', ''))[:300], int(head.get('total', 0))))
+            topics = [
+                [*(str(text)[:256] for text in row[:3]), int(row[3])] for row in head['topics'][:MAX_TOPICS] if len(row) == 4
+            ]
+            self._on_item(_catalog(topics, str(head.get('problem', ''))[:300], int(head.get('total', 0))))
             return
         if not self._pings:
             return  # its age would be unknown
@@ -283,9 +285,9 @@ def _check(kind: str, head: Mapping[str, Any], body: bytes) -> None:
             raise ValueError('the number of its values is wrong')
 
 
-def _is_figures(told: Any) -> bool:
+def _is_figures(figures: Any) -> bool:
     """Whether a page can draw these values."""
-    rows = told['topics']
+    rows = figures['topics']
     return isinstance(rows, list) and all(isinstance(row['topic'], str) and isinstance(row['type'], str) for row in rows)
 
 

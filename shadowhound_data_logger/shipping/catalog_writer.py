@@ -61,7 +61,7 @@ class CatalogWriter:
         self._gaps = _GapParts(spool, robot, clock)
         self._keeps = keeps
         self._kept_due_s = monotonic()
-        self._told: list[frozenset[tuple[int, str]]] = []
+        self._reported: list[frozenset[tuple[int, str]]] = []
         """The same for each file about kept objects."""
 
     def due(self) -> list[DataObject]:
@@ -113,12 +113,12 @@ class CatalogWriter:
 
     def _statistics_parts(self, rows: list[tuple[int, Row]], packed: Mapping[int, bytes]) -> Iterator[DataObject]:
         for begin in range(0, len(rows), OBJECTS_A_PART):
-            told = (
+            statistics = (
                 (number, one)
                 for number, row in rows[begin : begin + OBJECTS_A_PART]
                 for one in statistic_rows(row, unpack_statistics(packed[number]))
             )
-            yield from (self._part(*each, STATISTICS) for each in parts.by_folder(told))
+            yield from (self._part(*each, STATISTICS) for each in parts.by_folder(statistics))
 
     def _kept_parts(self) -> list[DataObject]:
         """Row files with kept objects that are in none yet and were not returned. Raises SpoolError or sqlite3.Error."""
@@ -128,8 +128,8 @@ class CatalogWriter:
             index.open()
             listed = index.catalog.unreported(MAX_ROWS)
         there = {(item.id, state) for state, _, item in listed}
-        self._told = [told for told in self._told if told <= there]
-        handed = frozenset[tuple[int, str]]().union(*self._told)
+        self._reported = [reports for reports in self._reported if reports <= there]
+        handed = frozenset[tuple[int, str]]().union(*self._reported)
         new = [each for each in listed if (each[2].id, each[0]) not in handed]
         rows = [
             (index, {**row_of(item.bucket, item.key, item.size, item.content_type, item.metadata),
@@ -138,10 +138,10 @@ class CatalogWriter:
         ]  # fmt: skip
         made = []
         for robot, date, found in parts.by_folder(rows):
-            told = tuple((new[index][2].id, new[index][0]) for index, _ in found)
+            reports = tuple((new[index][2].id, new[index][0]) for index, _ in found)
             part = self._part(robot, date, found, KEPT)
-            made.append(replace(part, catalogs=(), reports=told))
-            self._told.append(frozenset(told))
+            made.append(replace(part, catalogs=(), reports=reports))
+            self._reported.append(frozenset(reports))
         return made
 
     def _part(self, robot: str | None, date: str, found: list[tuple[int, Row]], of: TableSchema = OBJECTS) -> DataObject:
@@ -217,14 +217,16 @@ class _GapParts:
         for mark in marks:
             name = mark.sink, mark.topic, mark.session
             if mark.robot == self._robot and self._marks.get(name) != mark:
-                said = complete(
+                watermark = complete(
                     self._robot, f'{began_ns:x}', began_ns + newest, sink=mark.sink, topic=mark.topic, session=mark.session,
                     from_ns=mark.since_ns, to_ns=mark.complete_ns, received_from_ns=mark.received_since_ns,
                     received_to_ns=mark.received_complete_ns, grade=mark.grade, received=mark.received, skipped=mark.skipped,
                 )  # fmt: skip
-                if dates <= {date_of(said)}:  # otherwise rows and watermark are in two files, and either can be delivered first
+                if dates <= {
+                    date_of(watermark)
+                }:  # otherwise rows and watermark are in two files, and either can be delivered first
                     self._marks[name] = mark
-                    rows.append(said)
+                    rows.append(watermark)
         return self._made(rows, self._version)
 
     def _row(self, gap: Gap, began_ns: int) -> Statement:

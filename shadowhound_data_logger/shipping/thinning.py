@@ -57,15 +57,15 @@ class Thinner:
         return bool(self._min_hz) and self._spool.kept.is_short() and next(self._work)
 
     def _all(self) -> Iterator[bool]:
-        after = told_ns = 0
+        after = reported_ns = 0
         while True:
             window = self._window(after)
             if not window:
                 yield False
                 continue
             after = window[-1].id
-            if window[0].t_start_ns >= told_ns:  # what is new comes in small windows
-                told_ns = window[0].t_start_ns + HOUR_NS
+            if window[0].t_start_ns >= reported_ns:  # what is new comes in small windows
+                reported_ns = window[0].t_start_ns + HOUR_NS
                 log.info('room for what is kept runs short: pictures and clouds of the hour from %s on are thinned, to %g Hz',
                          iso(window[0].t_start_ns), self._min_hz)  # fmt: skip
             while window:

@@ -16,19 +16,19 @@ class RecordingTable(Table):
             for table in ('recordings', 'slices', 'missing'):
                 self._db.execute(f'DELETE FROM {table} WHERE owner = ? AND folder = ?', place)  # noqa: S608 - own constants only
             return
-        self._db.execute('INSERT OR REPLACE INTO recordings VALUES (?,?,?,?)', (*place, rows.said, rows.channels))
+        self._db.execute('INSERT OR REPLACE INTO recordings VALUES (?,?,?,?)', (*place, rows.facts, rows.channels))
         self._db.executemany('INSERT OR REPLACE INTO slices VALUES (?,?,?,?,?,?,?,?,?)', ((*place, *row) for row in rows.slices))
         self._db.executemany('INSERT OR REPLACE INTO missing VALUES (?,?,?,?,?,?,?,?)', ((*place, *row) for row in rows.missing))
 
     def rows(self, owner: str) -> list[RecordingRows]:
         """The recordings of an owner that are not complete yet."""
-        found = self._db.execute('SELECT folder, said, channels FROM recordings WHERE owner = ?', (owner,)).fetchall()
+        found = self._db.execute('SELECT folder, facts, channels FROM recordings WHERE owner = ?', (owner,)).fetchall()
         return [RecordingRows(
-            folder, said, channels,
+            folder, facts, channels,
             tuple(SliceRow(*one) for one in self._db.execute(
                 'SELECT number, bytes, sha256, t_start_ns, t_end_ns, messages, counts FROM slices'
                 ' WHERE owner = ? AND folder = ? ORDER BY number', (owner, folder))),
             tuple(MissingRow(*one) for one in self._db.execute(
                 'SELECT place, file, what, messages, topic, reason FROM missing WHERE owner = ? AND folder = ? ORDER BY place',
                 (owner, folder))),
-        ) for folder, said, channels in found]  # fmt: skip
+        ) for folder, facts, channels in found]  # fmt: skip

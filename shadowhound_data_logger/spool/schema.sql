@@ -129,7 +129,7 @@ CREATE INDEX requested_released ON requested (request, id, bytes) WHERE outcome 
 CREATE TABLE recordings (
   owner TEXT NOT NULL,          -- the robot, or the name of `bag record`
   folder TEXT NOT NULL,
-  said TEXT NOT NULL,
+  facts TEXT NOT NULL,
   channels TEXT NOT NULL,
   PRIMARY KEY (owner, folder)) WITHOUT ROWID;
 CREATE TABLE slices (

@@ -90,7 +90,7 @@ def test_the_last_record_of_a_slice_counts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('change', [
-    {'said': ''}, {'said': '[]'}, {'said': '{"bag": "../x"}'}, {'channels': '{}'}, {'channels': '[[1, 2, 3, 4, 5]]'},
+    {'facts': ''}, {'facts': '[]'}, {'facts': '{"bag": "../x"}'}, {'channels': '{}'}, {'channels': '[[1, 2, 3, 4, 5]]'},
     {'channels': '[["a"]]'}, {'slices': '[[1]]'}, {'slices': '[["0", 1, "", 1, 2, 3, "[]"]]'},
     {'slices': '[[0, 1, "", 1, 2, 3, "[-1]"]]'}, {'slices': '[[0, 1, 7, 1, 2, 3, "[]"]]'}, {'slices': '[[0, 1, "", 1, 2, 3, 7]]'},
     {'missing': '[[0, 7, "what", null, null, null]]'}, {'missing': '[' * 100_000}, {'slices': 'x'},

@@ -88,10 +88,10 @@ def test_recordings_are_kept_by_owner(root: Path) -> None:
     by_hand.open()
     one = RecordingRows('a', '{}', '[]', (SLICE,), (MISSING,))
     node.commit(rows=[RecordingRows('a', '{}', '[]'), one, one, replace(one, folder='b')])
-    by_hand.commit(rows=[replace(one, said='{"by": "hand"}')])
+    by_hand.commit(rows=[replace(one, facts='{"by": "hand"}')])
     node.commit(rows=[RecordingRows('b', is_whole=True)])
     assert node.reading.recordings.rows(node.robot) == [one]
-    assert by_hand.reading.recordings.rows(by_hand.robot) == [replace(one, said='{"by": "hand"}')]
+    assert by_hand.reading.recordings.rows(by_hand.robot) == [replace(one, facts='{"by": "hand"}')]
     node.commit(rows=[RecordingRows('a', is_whole=True)])
     assert (node.reading.recordings.rows(node.robot), len(by_hand.reading.recordings.rows(by_hand.robot))) == ([], 1)
     node.close()
