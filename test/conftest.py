@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import gc
 import os
+import shutil
 import signal
 import threading
 import time
@@ -49,6 +50,9 @@ WAITING = ('test/doctor/', 'test/e2e/', 'test/missions/', 'test/sim/', 'test/tow
 """Folders whose tests mostly wait for other processes."""
 NICENESS = os.nice(0) + 10
 """Of the other workers."""
+MEMORY = Path('/dev/shm')  # noqa: S108 - pytest makes a private folder in it
+MEMORY_BYTES = 8 << 30
+"""Free in it, for the folders of tests in ``make test``; otherwise they are on the disk, as in ``make test-long``."""
 HUNG_S = 60.0
 """After a test's timeout, until its process is ended: nothing else ends a test that waits in a library for a lock."""
 STDERR = pytest.StashKey[int]()
@@ -68,6 +72,8 @@ def pytest_configure(config: pytest.Config) -> None:
         config.args = found[first:] + found[:first]
     config.stash[STDERR] = os.dup(2)
     os.environ.update(THIS_MACHINE)
+    if not profiles.LONG and MEMORY.is_dir() and shutil.disk_usage(MEMORY).free >= MEMORY_BYTES:
+        os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', str(MEMORY))  # a quarter of the CPU time would be syncs to the disk
     gc.disable()
     botocore.session.create_loader = lru_cache(create_loader)  # each store would read the description of S3
     profiles.load()

@@ -31,7 +31,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def run(home: Path, *arguments: str | Path, **environ: str) -> Result:
-    env = {'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': '', 'SHADOWHOUND_ROBOT': 'thor', 'COLUMNS': '150', **environ}
+    env = {'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': '', 'SHADOWHOUND_ROBOT': 'thor', 'COLUMNS': '300', **environ}
     return CliRunner().invoke(bag, [str(each) for each in arguments], env=env, standalone_mode=False)
 
 

@@ -42,7 +42,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def run(home: Path, *arguments: str) -> Result:
-    env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '150', 'AWS_ENDPOINT_URL': ''}
+    env = {'SHADOWHOUND_HOME': str(home), 'COLUMNS': '300', 'AWS_ENDPOINT_URL': ''}
     return CliRunner().invoke(lake, ['verify', *arguments], env=env, standalone_mode=False)
 
 

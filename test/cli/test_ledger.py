@@ -415,8 +415,9 @@ def as_json(*arguments: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize('option', ['--verify', '--deep'])
-def test_verify_finds_a_complete_store(home: Path, option: str) -> None:
+def test_verify_finds_a_complete_store(home: Path, option: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exit code 0; the text has the number of objects, the store, and since when objects are remembered."""
+    monkeypatch.setenv('COLUMNS', '300')
     answer = run(option)
     assert answer.return_value == 0
     text = ' '.join(answer.stdout.split())

@@ -404,6 +404,7 @@ def test_a_status_without_a_robot_names_none(spool: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv('AMENT_PREFIX_PATH', str(spool.parent))
     answer = CliRunner().invoke(cli, ['status', '--json'], standalone_mode=False)
     assert (json.loads(answer.stdout)['robot'], answer.return_value) == (None, ExitCode.FINDING)
+    monkeypatch.setenv('COLUMNS', '300')
     text = ' '.join(CliRunner().invoke(cli, ['status'], standalone_mode=False).stdout.split())
     assert text.startswith('not running; no node has run here yet')
     assert f'there is no spool in {spool}: start the node' in text
