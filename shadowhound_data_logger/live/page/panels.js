@@ -328,7 +328,7 @@ export function Diagnostics() {
     const [kind, word] = LEVELS[level(row)];
     return html`<li key=${String(row[0])}><details><summary><span class=${`mark ${kind}`} role="img" aria-label=${word} title=${word}>${CLASSES[level(row)]}</span> <b>${String(row[0])}</b> ${String(row[2])}</summary>
       <dl>${row[3] ? html`<dt>hardware</dt><dd>${String(row[3])}</dd>` : ''}${(Array.isArray(row[4]) ? row[4] : []).map(([key, value]) => html`<dt>${String(key)}</dt><dd>${String(value)}</dd>`)}</dl></details></li>`;
-  })}</ul>${!rows.length && html`<${Why} kind="diagnostics" also="Nothing has come yet." />`}</${Panel}>`;
+  })}</ul>${!rows.length && html`<${Why} kind="diagnostics" also="Nothing has come since this panel was opened." />`}</${Panel}>`;
 }
 
 const SEVERITIES = [[10, 'debug', 'none'], [20, 'info', 'none'], [30, 'warning', 'watch'], [40, 'error', 'bad'], [50, 'fatal', 'bad']];
@@ -343,7 +343,7 @@ export function Log() {
     ${SEVERITIES.map(([number, word]) => html`<option value=${number}>${word}</option>`)}</select>`}><ul class="rows" hidden=${!shown.length} data-list="rosout">${shown.map((row) => {
     const [, word, kind] = SEVERITIES.find(([number]) => number >= row[1]) ?? SEVERITIES[4];
     return html`<li><small class="when">${now === null ? '' : span(Math.max(0, now - row[0]) / 1000)}</small> <b class=${kind}>${word}</b> <b>${String(row[2])}</b> ${String(row[3])}</li>`;
-  })}</ul>${!shown.length && html`<${Why} kind="rosout" also=${connection.value === 'connected' ? 'No line of this severity has come yet.' : ''} />`}</${Panel}>`;
+  })}</ul>${!shown.length && html`<${Why} kind="rosout" also=${connection.value === 'connected' ? 'No line of this severity has come since this panel was opened.' : ''} />`}</${Panel}>`;
 }
 
 // -- which panels there are ----------------------------------------------------------------------------------------------------
