@@ -65,6 +65,8 @@ class RobotRow:
             return BAD, 'it lost data that it had received'
         if self.lost:
             return WATCH, 'messages are missing today'
+        if not self.last_ns and not self.last_date:
+            return SILENT, 'the catalog has no data of it yet'
         if not self.last_ns or now_ns - self.last_ns > SILENT_NS:
             return SILENT, 'nothing arrived for more than a day'
         if self.last_ns - self.known_ns > BEHIND_NS:

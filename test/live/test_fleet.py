@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from lake.gap_parts import lost, mark, tell
-from lake.making import DAY_NS, NOON_NS, add_part, folder_store, row
+from lake.making import DAY_NS, NOON_NS, add, add_part, folder_store, row
 from live.browsing import CHROMIUM, HOSTILE, Served, fits, holds, opened, press
 from live.test_history import MISSION
 
@@ -66,6 +66,14 @@ def test_robots_that_need_attention_come_first(robots: Path) -> None:
     assert by_name['loki'].last_ns == NOON_NS + 2 * SECOND
     assert by_name['freya'].last_ns == 0
     assert by_name['freya'].last_date == '2026-09-28'
+
+
+def test_a_new_robot_is_not_silent(home: Path) -> None:
+    """Its folder is in the store before the first rows of its catalog: then nothing is known about its last message."""
+    with closing(open_store(folder_store(home), UploadSettings())) as store:
+        add(store, home / 'tmp', 'loki/camera/20261028/120000_x.jpg', b'x')
+    (found,) = overview(Bucket(folder_store(home), 'sensor-data'), Findings(lambda _: None), NOON_NS)
+    assert found.state(NOON_NS) == (SILENT, 'the catalog has no data of it yet')
 
 
 def test_data_that_the_robot_had_and_lost_is_worse(robots: Path) -> None:
