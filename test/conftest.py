@@ -73,7 +73,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[STDERR] = os.dup(2)
     os.environ.update(THIS_MACHINE)
     if not profiles.LONG and MEMORY.is_dir() and shutil.disk_usage(MEMORY).free >= MEMORY_BYTES:
-        os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', str(MEMORY))  # a quarter of the CPU time would be syncs to the disk
+        os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', str(MEMORY))  # syncs to the disk take CPU time
     gc.disable()
     botocore.session.create_loader = lru_cache(create_loader)  # each store would read the description of S3
     profiles.load()
@@ -102,12 +102,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
             if nodeid.startswith(ONE_TEAM):
                 return 'team'
             return 'robots' if has_robot(nodeid) else str(super()._split_scope(nodeid))
-
-        def _pending_of(self, workload: dict[str, dict[str, bool]]) -> int:
-            """Without the files that are done: all tests would be counted with each report, which took 7 s of CPU time."""
-            for name in [name for name, unit in workload.items() if all(unit.values())]:
-                del workload[name]
-            return int(super()._pending_of(workload))
 
         def remove_node(self, node: Any) -> str | None:
             """The test that ended a worker is not run again: it would end all workers."""
