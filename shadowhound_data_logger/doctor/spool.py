@@ -89,7 +89,7 @@ def _node(report: status.NodeReport, folder: Path) -> Iterator[Result]:
     if store.state not in status.FINE_STORE:
         yield warning(
             'node.delivery',
-            f'delivery: {store.state.replace("_", " ")}',
+            status.stopped(store.state),
             store.last_error or 'the node reports no reason',
             STORE,
         )
@@ -97,7 +97,7 @@ def _node(report: status.NodeReport, folder: Path) -> Iterator[Result]:
     yield from _undiscovered(undiscovered)
     yield from _front(node)
     missed = {topic: (row.missed or row.missed_estimated or 0) + row.dropped + row.rejected for topic, row in node.topics.items()}
-    listed = tuple(row.text for row in undiscovered.values())
+    listed = (status.stopped(store.state), *(row.text for row in undiscovered.values()))
     for text in report.findings:
         if not text.startswith(('delivery:', 'front fails:', *listed)):
             yield warning('node.status', text, 'reported by the node itself', _status_remedy(text), lost=sum(missed.values()))

@@ -204,6 +204,11 @@ def _findings(report: NodeReport) -> Iterator[str]:
             yield f'quarantined in this session: {node.store.quarantined:,} objects'
 
 
+def stopped(state: str) -> str:
+    """The finding for a state of delivery that is not fine."""
+    return STOPPED_STORE.get(state, f'delivery: {state.replace("_", " ")}')
+
+
 def _faults(node: NodeStatus) -> Iterator[str]:
     """What is failing now."""
     store = node.store
@@ -213,7 +218,7 @@ def _faults(node: NodeStatus) -> Iterator[str]:
         what = 'objects go without a date' if node.clock.gave_up else 'objects wait for their date'
         yield f'the clock of this machine is not set: {what}'
     if store.state not in FINE_STORE:
-        yield STOPPED_STORE.get(store.state, f'delivery: {store.state.replace("_", " ")}')
+        yield stopped(store.state)
     yield from store.stuck.values()
     yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store.blocked_buckets.items())
     yield from (f'{name} fails: {worker.last_error}' for name, worker in node.workers.items() if worker.failing)
