@@ -96,7 +96,7 @@ class _View:
             self.is_latched, self._is_gathered = panel.is_latched, panel.is_gathered
         else:
             self.kind = KINDS[type_name]
-        self._is_each_shown = not self.kind.is_bulk and 1 / self.kind.max_hz < POLL_S
+        self._is_each_shown = not self.kind.is_bulk and 2 / self.kind.max_hz < POLL_S  # of the others one a poll is enough
         self.depth = ROWS_DEPTH if self._is_gathered or self._is_each_shown else BULK_DEPTH if self.kind.is_bulk else 1
         self._next_s = 0.0
         self._waiting: list[Taken] = []
