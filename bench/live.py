@@ -102,7 +102,7 @@ class Watcher:
                 if acknowledging is None or acknowledging.done():
                     acknowledging = asyncio.create_task(acknowledge())
                 for head, body in items:
-                    if head['kind'] == 'video':
+                    if head['kind'] == 'video' and self.video is not None:
                         await self.video.on_item(head)
                     if 'at' in head and head['kind'] in KINDS:
                         self.note(head, body)
